@@ -1,0 +1,1 @@
+"""From counts to quantities, from quantities to parameters."""

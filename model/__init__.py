@@ -1,0 +1,1 @@
+"""Physics only: NumPy and SciPy, no I/O, no hardware."""

@@ -1,0 +1,1 @@
+"""The experiment log: schema, writer, reader, dataset."""

@@ -1,0 +1,1 @@
+"""The simulated bench: specimen physics and one wire-level instrument per driver."""
