@@ -1,0 +1,132 @@
+"""One force-displacement curve at one voltage, with all that identification must know about its errors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from model.specimen import Specimen
+
+Array = NDArray[np.float64]
+
+UNCERTAINTIES = (
+    "displacement_noise",
+    "force_gain",
+    "force_zero",
+    "displacement_zero",
+    "displacement_gain",
+    "voltage_gain",
+    "thickness_uncertainty",
+    "prestretch_uncertainty",
+    "disk_radius_uncertainty",
+)
+
+
+class CurveError(ValueError):
+    """A curve that cannot be used; the message names the curve and the field."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Curve:
+    """Samples of force against displacement, taken at one nominal voltage in one run, in the order of time.
+
+    SI units. ``nan`` in ``h``, ``force`` or ``voltage`` marks a sample without that value; such samples, and those
+    with ``flagged`` set, are left out of a fit and counted.
+
+    Parameters
+    ----------
+    label : str
+        What the curve is called in tables and figures, e.g. ``"a = 4 mm, 1000 V"``.
+    run : str
+        Which log it is from. The errors of the force zero and of the displacement zero are shared inside a run.
+    specimen : model.specimen.Specimen
+        Geometry as measured; its material is the starting guess only.
+    h, force : ndarray, shape (n,)
+        Displacement of the disk (m) and the force that pulls it out of plane (N), zeros already taken off.
+    voltage : ndarray, shape (n,)
+        Voltage at each sample (V), measured or nominal; zeros where there is no HV in the scene.
+    nominal_voltage : float
+        The voltage the protocol asked for (V). 0 in every curve of a data set means: no permittivity in the fit.
+    direction : ndarray of int, shape (n,)
+        +1 loading, -1 unloading, 0 neither (a hold).
+    force_noise, displacement_noise : float
+        Standard deviation of one sample (N, m), independent from sample to sample.
+    force_gain, displacement_gain, voltage_gain : float
+        Relative standard uncertainties of the instruments' gains; the same error in all curves of a fit.
+    force_zero, displacement_zero : float
+        Standard uncertainties of the zeros that were taken off (N, m); the same error in all curves of a run.
+    thickness_uncertainty, prestretch_uncertainty, disk_radius_uncertainty : float
+        Relative standard uncertainties of the specimen's own dimensions; taken as the same error in all curves of a
+        fit (films of one batch, one punch), which is the cautious choice.
+    flagged : ndarray of bool, shape (n,), optional
+        Samples that an instrument itself called bad.
+    """
+
+    label: str
+    run: str
+    specimen: Specimen
+    h: Array
+    force: Array
+    voltage: Array
+    nominal_voltage: float
+    direction: NDArray[np.int8]
+    force_noise: float
+    displacement_noise: float = 0.0
+    force_gain: float = 0.0
+    force_zero: float = 0.0
+    displacement_zero: float = 0.0
+    displacement_gain: float = 0.0
+    voltage_gain: float = 0.0
+    thickness_uncertainty: float = 0.0
+    prestretch_uncertainty: float = 0.0
+    disk_radius_uncertainty: float = 0.0
+    flagged: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        n = np.size(self.h)
+        if n == 0:
+            raise CurveError(f"curve {self.label!r}: it has no samples")
+        for name in ("h", "force", "voltage"):
+            column = self._column(name, np.float64, n)
+            if np.isinf(column).any():
+                raise CurveError(f"curve {self.label!r}: {name} holds an infinite value; mark a missing value by nan")
+        if not np.isin(self.direction, (-1, 0, 1)).all():
+            raise CurveError(f"curve {self.label!r}: direction must be +1 (loading), -1 (unloading) or 0 (neither)")
+        self._column("direction", np.int8, n)
+        if self.flagged is None:
+            object.__setattr__(self, "flagged", np.zeros(n, dtype=np.bool_))
+        self._column("flagged", np.bool_, n)
+        if not math.isfinite(self.nominal_voltage):
+            raise CurveError(f"curve {self.label!r}: nominal_voltage is {self.nominal_voltage}, not a voltage")
+        if not 0.0 < self.force_noise < math.inf:
+            raise CurveError(
+                f"curve {self.label!r}: force_noise is {self.force_noise} N; it must be positive, for it is the weight "
+                "of every sample. The certificate of the force sensor states it"
+            )
+        for name in UNCERTAINTIES:
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise CurveError(f"curve {self.label!r}: {name} is {value}; a standard uncertainty is 0 or more")
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Samples that have all three values and no flag of an instrument; shape (n,)."""
+        usable: NDArray[np.bool_] = np.isfinite(self.h) & np.isfinite(self.force) & np.isfinite(self.voltage)
+        return usable if self.flagged is None else usable & ~self.flagged
+
+    def _column(self, name: str, dtype: Any, n: int) -> NDArray[Any]:
+        """Replace a field by a read-only copy of itself as an array of n numbers."""
+        try:
+            column = np.array(getattr(self, name), dtype=dtype)
+        except (TypeError, ValueError) as error:
+            raise CurveError(f"curve {self.label!r}: {name} is not a list of numbers") from error
+        if column.shape != (n,):
+            raise CurveError(f"curve {self.label!r}: {name} has shape {column.shape}, and h has {n} samples")
+        column.setflags(write=False)
+        object.__setattr__(self, name, column)
+        return column
