@@ -1,0 +1,227 @@
+"""The certificate of one instrument: what turns its readings into quantities, how well, from when until when.
+
+A certificate is a small TOML file, kept beside the scenes that use it and attached byte for byte to every log::
+
+    format = "dea-rig certificate 1"
+    role = "force"                       # force | displacement | hv
+    instrument = "GSV-8 with 1 N cell"
+    serial = "12345678"                  # as the instrument states it; "" if it states none
+    valid_from = 2025-01-01
+    valid_until = 2026-01-01
+    gain_N_per_mV_per_V = 0.5            # quantity = gain * (reading - reading at zero)
+    gain_relative_uncertainty = 1e-3     # standard uncertainty (k = 1), as are all others
+    noise_N = 5e-3                       # standard deviation of one sample
+    zero_uncertainty_N = 2e-4            # of a zero taken before the run, drift until its end included
+    range_N = [-1.0, 1.0]                # calibrated range; no extrapolation
+
+The keys of a displacement certificate end in ``_m`` with ``gain_m_per_m``, those of an HV certificate in ``_V`` with
+``gain_V_per_V``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+FORMAT = "dea-rig certificate 1"
+LARGEST_BYTES = 256 * 1024  # a certificate is a page; a larger file is a mistake or an attack on the parser
+
+Role = Literal["force", "displacement", "hv"]
+
+
+class CertificateError(ValueError):
+    """A certificate that cannot be used; the message names file, key and value, and what is allowed."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A certificate as read, in SI units.
+
+    Attributes
+    ----------
+    role, instrument, serial, valid_from, valid_until
+        As in the file.
+    gain : float
+        Quantity (N, m, V) per unit of the reading (mV/V, m, V).
+    gain_uncertainty : float
+        Relative standard uncertainty of the gain.
+    noise, zero_uncertainty : float
+        Standard deviation of one sample; standard uncertainty of a zero (N, m, V).
+    low, high : float
+        Ends of the calibrated range (N, m, V).
+    name : str
+        File name, for messages.
+    raw : bytes
+        The file itself, byte for byte.
+    """
+
+    role: Role
+    instrument: str
+    serial: str
+    valid_from: date
+    valid_until: date
+    gain: float
+    gain_uncertainty: float
+    noise: float
+    zero_uncertainty: float
+    low: float
+    high: float
+    name: str
+    raw: bytes
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the exact bytes, in hexadecimal."""
+        return hashlib.sha256(self.raw).hexdigest()
+
+    def check(self, serial: str, today: date) -> list[str]:
+        """What speaks against using this certificate today for the instrument that states ``serial``.
+
+        An instrument that states no serial number (``""``) cannot be told from another one; only the dates are
+        checked then. An empty list means: nothing speaks against it.
+        """
+        problems = []
+        if not self.valid_from <= today:
+            problems.append(
+                f"{self.name}: the {self.role} certificate is valid from {self.valid_from}, not yet {today}"
+            )
+        if not today <= self.valid_until:
+            problems.append(f"{self.name}: the {self.role} certificate expired on {self.valid_until}; today is {today}")
+        if serial and serial != self.serial:
+            problems.append(
+                f"{self.name}: the {self.role} certificate is for serial number {self.serial or '(none)'}, "
+                f"the instrument says {serial}"
+            )
+        return problems
+
+    def covers(self, quantity: float) -> bool:
+        """Whether ``quantity`` (N, m, V) lies in the calibrated range; nan does not."""
+        return self.low <= quantity <= self.high
+
+
+def load_certificate(path: Path) -> Certificate:
+    """Read one certificate. Raises `CertificateError`."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(LARGEST_BYTES + 1)
+    except OSError as error:
+        raise CertificateError(f"{path}: cannot read the certificate: {error.strerror}") from error
+    return parse_certificate(raw, str(path))
+
+
+def parse_certificate(raw: bytes, name: str) -> Certificate:
+    """A certificate from its bytes, as found in a file or attached to a log. Raises `CertificateError`."""
+    if len(raw) > LARGEST_BYTES:
+        raise CertificateError(f"{name}: larger than {LARGEST_BYTES // 1024} kB; this is no certificate")
+    try:
+        table = tomllib.loads(raw.decode("utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise CertificateError(f"{name}: not a TOML file: {str(error) or 'nested too deeply'}") from error
+    if table.get("format") != FORMAT:
+        raise CertificateError(f"{name}: format is {table.get('format')!r}; this program reads {FORMAT!r}")
+    try:
+        return _FILE.validate_python(table).certificate(name, raw)
+    except ValidationError as error:
+        lines = []
+        for item in error.errors(include_url=False, include_context=False):
+            where = [str(part) for part in item["loc"] if part not in ("force", "displacement", "hv")]
+            value = "" if item["type"] in ("missing", "extra_forbidden") else f" (it is {item['input']!r})"
+            lines.append(f"{name}: {'.'.join(where) or 'certificate'}: {item['msg']}{value}")
+        raise CertificateError("\n".join(lines)) from error
+
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Relative = Annotated[float, Field(ge=0, lt=1)]
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+Text = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    format: Literal["dea-rig certificate 1"]
+    instrument: Text
+    serial: Annotated[str, Field(max_length=64)]
+    valid_from: date
+    valid_until: date
+    method: Text | None = None
+    gain_relative_uncertainty: Relative
+
+    @model_validator(mode="after")
+    def _in_order(self) -> _File:
+        if not self.valid_from <= self.valid_until:
+            raise ValueError(f"valid_from {self.valid_from} comes after valid_until {self.valid_until}")
+        return self
+
+    def _certificate(
+        self, role: Role, gain: float, noise: float, zero: float, ends: list[float], name: str, raw: bytes
+    ) -> Certificate:
+        low, high = ends
+        if not low < high:
+            raise CertificateError(f"{name}: the range must run from the lower to the higher end, it is {ends}")
+        return Certificate(
+            role=role,
+            instrument=self.instrument,
+            serial=self.serial,
+            valid_from=self.valid_from,
+            valid_until=self.valid_until,
+            gain=gain,
+            gain_uncertainty=self.gain_relative_uncertainty,
+            noise=noise,
+            zero_uncertainty=zero,
+            low=low,
+            high=high,
+            name=name,
+            raw=raw,
+        )
+
+
+class _ForceFile(_File):
+    role: Literal["force"]
+    gain_N_per_mV_per_V: Positive
+    noise_N: Positive
+    zero_uncertainty_N: NotNegative
+    range_N: Range
+
+    def certificate(self, name: str, raw: bytes) -> Certificate:
+        return self._certificate(
+            "force", self.gain_N_per_mV_per_V, self.noise_N, self.zero_uncertainty_N, self.range_N, name, raw
+        )
+
+
+class _DisplacementFile(_File):
+    role: Literal["displacement"]
+    gain_m_per_m: Positive
+    noise_m: NotNegative
+    zero_uncertainty_m: NotNegative
+    range_m: Range
+
+    def certificate(self, name: str, raw: bytes) -> Certificate:
+        return self._certificate(
+            "displacement", self.gain_m_per_m, self.noise_m, self.zero_uncertainty_m, self.range_m, name, raw
+        )
+
+
+class _HVFile(_File):
+    role: Literal["hv"]
+    gain_V_per_V: Positive
+    noise_V: NotNegative
+    zero_uncertainty_V: NotNegative
+    range_V: Range
+
+    def certificate(self, name: str, raw: bytes) -> Certificate:
+        return self._certificate(
+            "hv", self.gain_V_per_V, self.noise_V, self.zero_uncertainty_V, self.range_V, name, raw
+        )
+
+
+_FILE: TypeAdapter[_ForceFile | _DisplacementFile | _HVFile] = TypeAdapter(
+    Annotated[_ForceFile | _DisplacementFile | _HVFile, Field(discriminator="role")]
+)
