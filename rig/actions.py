@@ -1,0 +1,229 @@
+"""How each action of a plan is carried out: generators that the engine's loop resumes once a turn.
+
+An action gives commands through the engine and yields until what it waits for has happened; the loop polls the
+instruments and checks the limits between two turns. An action that takes much longer than planned is a fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.roles import HVFlag
+from rig.errors import FaultError, LimitError
+from rig.plan import Action
+from rig.safety.guard import check_path
+
+if TYPE_CHECKING:
+    from rig.engine import Engine
+
+Turns = Generator[None, None, None]
+
+PATIENCE = 1.5  # an action may take this many times its planned duration, and GRACE_S more
+GRACE_S = 10.0
+CONTACT_WINDOW_S = 0.25  # force is averaged over this long before it is held against the contact threshold
+CONTACT_SIGMAS = 4.0  # the threshold must exceed the noise of that average this many times
+HOMING_LIMIT_S = 90.0
+
+
+def carry_out(engine: Engine, action: Action) -> Turns:
+    """The generator that carries out ``action``."""
+    return _BY_KIND.get(action.kind, _move_or_voltage)(engine, action)
+
+
+def _wait(engine: Engine, done: Callable[[], bool], limit: float, what: str) -> Turns:
+    """Yield until ``done()``; a fault after ``limit`` seconds."""
+    end = engine.clock.now() + limit
+    while not done():
+        if engine.clock.now() > end:
+            raise FaultError(f"{what} did not happen within {limit:.0f} s.")
+        yield
+
+
+def _pause(engine: Engine, duration: float) -> Turns:
+    end = engine.clock.now() + duration
+    while engine.clock.now() < end:
+        yield
+
+
+def _patience(action: Action) -> float:
+    return action.duration * PATIENCE + GRACE_S
+
+
+def _home(engine: Engine, action: Action) -> Turns:
+    stage = engine.bench.stage
+    engine.command("stage", "home", "")
+    stage.home()
+    yield from _wait(engine, lambda: not stage.moving, HOMING_LIMIT_S, "The end of the stage's homing")
+    if not stage.referenced:
+        raise FaultError("stage: homing ended, but the stage still reports no reference position.")
+
+
+def _zero(engine: Engine, action: Action) -> Turns:
+    """Mean of every unloaded sensor and its standard error, taken as independent samples."""
+    recorder = engine.recorder
+    force: list[float] = []
+    laser: list[float] = []
+    engine.force_listener = lambda sample, _: force.append(sample.reading)
+    engine.displacement_listener = lambda sample: laser.append(sample.displacement)
+    try:
+        yield from _pause(engine, action.parameters["duration"])
+    finally:
+        engine.force_listener = engine.displacement_listener = None
+    recorder.force_zero, error = _mean(force, "force")
+    engine.force_noise = error * math.sqrt(len(force)) * engine.gains.force
+    recorder.reference("force_zero", recorder.force_zero, error, "mV/V")
+    if recorder.has_laser:
+        recorder.displacement_zero, error = _mean(laser, "displacement")
+        recorder.reference("displacement_zero", recorder.displacement_zero, error, "m")
+
+
+def _mean(readings: list[float], role: str) -> tuple[float, float]:
+    values = np.array(readings)
+    if len(values) < 10:
+        raise FaultError(f"{role}: only {len(values)} samples arrived during the zero step; at least 10 are needed.")
+    if not np.isfinite(values).all():
+        raise FaultError(f"{role}: the sensor gave no valid value during the zero step; is it in range?")
+    return float(values.mean()), float(values.std(ddof=1) / math.sqrt(len(values)))
+
+
+def _approach(engine: Engine, action: Action) -> Turns:
+    """Advance until the averaged force exceeds the threshold; then work out where it began to rise.
+
+    With a laser the contact position is where the laser says zero. Without, it is the corner of the line
+    ``max(0, k (x - x0))`` through the forces met on the way.
+    """
+    recorder, stage = engine.recorder, engine.bench.stage
+    threshold = action.parameters["threshold"]
+    n = max(4, round(CONTACT_WINDOW_S * engine.bench.force.rate))
+    needed = CONTACT_SIGMAS * engine.force_noise / math.sqrt(n)
+    if not threshold >= needed:
+        raise LimitError(
+            f"Step {action.step} (approach): threshold {threshold * 1e3:.3g} mN is lost in the force noise; "
+            f"give threshold_mN of at least {needed * 1e3:.2g}."
+        )
+    start = recorder.stage
+    assert start is not None
+    goal = min(start.position + action.parameters["max_travel"], stage.travel[1])
+    positions: list[float] = []
+    forces: list[float] = []
+
+    def listen(_: object, force: float) -> None:
+        assert recorder.stage is not None
+        positions.append(recorder.stage.position)
+        forces.append(force)
+
+    engine.force_listener = listen
+    try:
+        engine.move_stage(goal, action.speed)
+        end = engine.clock.now() + _patience(action)
+        while not (len(forces) >= n and float(np.mean(forces[-n:])) > threshold):
+            if not stage.moving or engine.clock.now() > end:
+                raise FaultError(
+                    f"The film was not met within {action.parameters['max_travel'] * 1e3:g} mm of travel. "
+                    "Is the specimen mounted, and the force sensor connected?"
+                )
+            yield
+    finally:
+        engine.force_listener = None
+        engine.stop_stage()
+    yield from _wait(engine, lambda: not stage.moving, GRACE_S, "The stage's standstill")
+    if recorder.has_laser:
+        recorder.contact, error = yield from _contact_by_laser(engine)
+    else:
+        recorder.contact, error = _corner(np.array(positions), np.array(forces))
+    recorder.reference("contact_position", recorder.contact, error, "m")
+    engine.move_to(0.0, action.speed, 0.0)
+    yield from _wait(engine, lambda: not stage.moving, GRACE_S, "The return to the contact position")
+
+
+def _contact_by_laser(engine: Engine) -> Generator[None, None, tuple[float, float]]:
+    """Stage position minus laser displacement at a standstill, and its standard error."""
+    laser: list[float] = []
+    recorder = engine.recorder
+    engine.displacement_listener = lambda sample: laser.append(recorder.quantity_of(sample))
+    try:
+        yield from _pause(engine, 0.5)
+    finally:
+        engine.displacement_listener = None
+    displacement, error = _mean(laser, "displacement")
+    assert recorder.stage is not None
+    return recorder.stage.position - displacement, error
+
+
+def _corner(x: NDArray[np.float64], force: NDArray[np.float64]) -> tuple[float, float]:
+    """Least-squares corner x0 of ``max(0, k (x - x0))``, with a standard error from the residual's curvature."""
+    candidates = np.linspace(x.min(), x.max(), 401)[:-1]
+    ramp = np.maximum(x[:, None] - candidates, 0.0)
+    norm = np.einsum("ij,ij->j", ramp, ramp)
+    slope = np.maximum(force @ ramp, 0.0) / np.maximum(norm, 1e-30)
+    cost = ((force[:, None] - slope * ramp) ** 2).sum(axis=0)
+    best = int(np.argmin(cost))
+    variance = cost[best] / max(len(x) - 2, 1)
+    # One standard error is where the sum of squares has risen by one variance.
+    inside = candidates[cost <= cost[best] + variance]
+    step = candidates[1] - candidates[0]
+    return float(candidates[best]), float(max(np.ptp(inside) / 2, step))
+
+
+def _hold(engine: Engine, action: Action) -> Turns:
+    yield from _pause(engine, action.parameters["duration"])
+
+
+def _move_or_voltage(engine: Engine, action: Action) -> Turns:
+    if action.voltage[0] != action.voltage[1]:
+        yield from _set_voltage(engine, action)
+    elif action.moves:
+        yield from _move(engine, action)
+
+
+def _move(engine: Engine, action: Action) -> Turns:
+    stage = engine.bench.stage
+    engine.move_to(action.h[1], action.speed, action.voltage[1])
+    yield from _wait(engine, lambda: not stage.moving, _patience(action), "The end of the stage's move")
+
+
+def _set_voltage(engine: Engine, action: Action) -> Turns:
+    """Ramp and wait for the *measured* voltage to arrive, then settle."""
+    target = action.voltage[1]
+    tolerance = max(10.0, 0.01 * target)
+    engine.request_voltage(target)
+
+    def arrived() -> bool:
+        sample = engine.recorder.hv
+        return (
+            sample is not None
+            and HVFlag.RAMPING not in sample.flags
+            and sample.setpoint == target
+            and abs(sample.voltage - target) <= tolerance
+        )
+
+    yield from _wait(engine, arrived, _patience(action), f"The measured voltage's arrival at {target:g} V")
+    yield from _pause(engine, action.parameters["settle"])
+
+
+def _return(engine: Engine, action: Action) -> Turns:
+    if action.voltage[0] != action.voltage[1]:
+        yield from _set_voltage(engine, action)
+        return
+    yield from _move(engine, action)
+    engine.recorder.contact = math.nan
+
+
+_BY_KIND: dict[str, Callable[[Engine, Action], Turns]] = {
+    "home": _home,
+    "zero": _zero,
+    "approach": _approach,
+    "hold": _hold,
+    "return": _return,
+}
+
+
+def film_checked(engine: Engine, h: float, voltage: float) -> None:
+    """Check the film from where it is to displacement ``h`` at ``voltage``, when there is voltage to check."""
+    here = engine.recorder.displacement
+    check_path(engine.film, here if math.isfinite(here) else 0.0, h, voltage)

@@ -1,0 +1,191 @@
+"""From a scene to instruments that can be polled: links opened, drivers attached, one clock for all.
+
+The same drivers sit on real ports and on the simulated bench in memory; only this module knows which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from drivers.link import ByteLink, CanFrame, FrameLink
+from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Stage
+from rig.clock import Clock, RealClock, VirtualClock
+from rig.scene import GSV8Table, IsegTable, KeyenceTable, Scene, ZaberTable
+
+if TYPE_CHECKING:
+    from rig.sim.bench import SimulatedBench
+
+
+class Tap(Protocol):
+    """Is told every byte and frame: before it is sent, and as soon as it has been read."""
+
+    def __call__(self, role: str, way: Literal["rx", "tx"], data: bytes) -> None: ...
+
+
+class TappedByteLink:
+    """A serial link whose traffic is told to a tap."""
+
+    def __init__(self, role: str, link: ByteLink, tap: Tap) -> None:
+        self.name = link.name
+        self._role = role
+        self._link = link
+        self._tap = tap
+
+    def read(self) -> bytes:
+        data = self._link.read()
+        if data:
+            self._tap(self._role, "rx", data)
+        return data
+
+    def write(self, data: bytes) -> None:
+        self._tap(self._role, "tx", data)
+        self._link.write(data)
+
+    def close(self) -> None:
+        self._link.close()
+
+
+class TappedFrameLink:
+    """A CAN link whose frames are told to a tap as identifier (two bytes, big-endian) and data."""
+
+    def __init__(self, role: str, link: FrameLink, tap: Tap) -> None:
+        self.name = link.name
+        self._role = role
+        self._link = link
+        self._tap = tap
+
+    def read(self) -> list[CanFrame]:
+        frames = self._link.read()
+        for frame in frames:
+            self._tap(self._role, "rx", frame.id.to_bytes(2, "big") + frame.data)
+        return frames
+
+    def write(self, frame: CanFrame) -> None:
+        self._tap(self._role, "tx", frame.id.to_bytes(2, "big") + frame.data)
+        self._link.write(frame)
+
+    def close(self) -> None:
+        self._link.close()
+
+
+class Bench:
+    """The instruments of one scene behind one clock.
+
+    Opening a bench opens ports; it sends nothing. Drivers come to life with `attach`, so that a log can be there
+    before the first byte is sent.
+
+    Attributes
+    ----------
+    clock : Clock
+        Virtual when the simulated bench is in memory, real otherwise.
+    simulated : SimulatedBench or None
+        The bench in memory, with its hidden truth, for tests and for the demonstration's comparison.
+    """
+
+    stage: Stage
+    force: ForceSensor
+    displacement: DisplacementSensor | None
+    hv: HVSupply | None
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.simulated: SimulatedBench | None = None
+        self.clock: Clock
+        self._byte_links: dict[str, ByteLink] = {}
+        self._frame_links: dict[str, FrameLink] = {}
+        self.devices: dict[str, Device] = {}
+        try:
+            if scene.on_real_ports:
+                self._open_ports()
+            else:
+                self._open_memory()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open_ports(self) -> None:
+        self.clock = RealClock()
+        for role, table in self.scene.instruments.items():
+            if isinstance(table, IsegTable):
+                from drivers.can_link import CanLink
+
+                assert table.interface is not None and table.can_channel is not None
+                self._frame_links[role] = CanLink(role, table.interface, table.can_channel, table.bitrate)
+            else:
+                from drivers.serial_link import SerialLink
+
+                assert table.port is not None
+                self._byte_links[role] = SerialLink(role, table.port, table.baud)
+
+    def _open_memory(self) -> None:
+        from rig.memory_link import MemoryByteLink, MemoryFrameLink
+        from rig.sim.wire import FrameWire
+
+        simulated = simulated_bench(self.scene)
+        clock = VirtualClock(simulated.advance)
+        for role in self.scene.instruments:
+            wire = simulated.wire(role)
+            if isinstance(wire, FrameWire):
+                self._frame_links[role] = MemoryFrameLink(role, wire, clock)
+            else:
+                self._byte_links[role] = MemoryByteLink(role, wire, clock)
+        self.simulated = simulated
+        self.clock = clock
+
+    def attach(self, tap: Tap) -> None:
+        """Put the drivers on their links; from here on they may be polled."""
+        self.displacement = None
+        self.hv = None
+        bytes_of: Callable[[str], ByteLink] = lambda role: TappedByteLink(role, self._byte_links[role], tap)  # noqa: E731
+        for role, table in self.scene.instruments.items():
+            match table:
+                case ZaberTable():
+                    from drivers.zaber import ZaberStage
+
+                    self.stage = ZaberStage(
+                        role,
+                        bytes_of(role),
+                        device=table.device,
+                        axis=table.axis,
+                        poll_rate_Hz=table.poll_rate_Hz,
+                    )
+                    self.devices[role] = self.stage
+                case GSV8Table():
+                    from drivers.gsv8 import GSV8
+
+                    self.force = GSV8(role, bytes_of(role), channel=table.channel, rate_Hz=table.rate_Hz)
+                    self.devices[role] = self.force
+                case KeyenceTable():
+                    from drivers.keyence_lkg import KeyenceLKG
+
+                    self.displacement = KeyenceLKG(
+                        role, bytes_of(role), output=table.output, poll_rate_Hz=table.poll_rate_Hz
+                    )
+                    self.devices[role] = self.displacement
+                case IsegTable():
+                    from drivers.iseg_edcp import IsegEDCP
+
+                    self.hv = IsegEDCP(
+                        role,
+                        TappedFrameLink(role, self._frame_links[role], tap),
+                        module=table.module,
+                        channel=table.channel,
+                        poll_rate_Hz=table.poll_rate_Hz,
+                    )
+                    self.devices[role] = self.hv
+
+    def close(self) -> None:
+        """Close every device and link, whatever state they are in."""
+        for thing in [*self.devices.values(), *self._byte_links.values(), *self._frame_links.values()]:
+            thing.close()
+
+
+def simulated_bench(scene: Scene) -> SimulatedBench:
+    """The simulated bench that a scene's ``[simulation]`` table describes, with only the instruments it names."""
+    from rig.errors import ConfigError
+    from rig.sim.bench import SimulatedBench
+
+    if scene.simulation is None:
+        raise ConfigError("This scene has no [simulation] table, so there is nothing to simulate.")
+    return SimulatedBench(scene.simulation, scene.specimen.specimen(), set(scene.instruments))

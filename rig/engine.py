@@ -1,0 +1,356 @@
+"""The engine: one single-threaded loop that polls the instruments, checks the limits and carries out the plan.
+
+Whatever ends a run, `Engine.run` goes through `_make_safe`: the stage stops, the output goes off, and the log says
+by *measured* values in what state the rig was left. Nothing can skip it: signals only set a flag that hastens it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from drivers.link import DeviceError
+from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample
+from rig.actions import carry_out, film_checked
+from rig.bench import Bench
+from rig.errors import ConfigError, FaultError, LimitError, RigError, Stopped
+from rig.plan import Action
+from rig.recorder import Gains, Recorder
+from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
+from rig.safety.limits import FilmLimits, Limits
+from rig.signals import StopRequest
+
+if TYPE_CHECKING:
+    from rig.log.writer import LogWriter
+
+TURN_S = 0.005  # the loop comes round at least this often
+SETUP_LIMIT_S = 15.0
+SILENCE_PERIODS = 10.0  # a sensor silent for this many of its periods, and at least SILENCE_S, is a fault
+SILENCE_S = 0.5
+FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
+SAFE_LIMIT_S = 60.0  # a ramp down takes as long as it takes; after this the output is called NOT SAFE
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Why the run ended, and the measured state it ended in.
+
+    ``status`` is one of complete, stopped, limit, fault. ``safe`` is True only when the output was *measured* below
+    60 V twice, or when the scene has no HV.
+    """
+
+    status: str
+    reason: str
+    safe: bool
+    voltage: float
+    force: float
+    position: float
+    duration: float
+
+    def as_text(self) -> dict[str, str]:
+        """As the log's metadata: text only, units in the names."""
+        return {
+            "status": self.status,
+            "reason": self.reason,
+            "safe": "yes" if self.safe else "NO",
+            "measured_voltage_V": f"{self.voltage:.1f}",
+            "measured_force_N": f"{self.force:.5f}",
+            "stage_position_mm": f"{self.position * 1e3:.4f}",
+            "duration_s": f"{self.duration:.3f}",
+        }
+
+
+class Engine:
+    """Runs one plan on one bench into one log.
+
+    Parameters
+    ----------
+    bench : Bench
+        Opened, not yet attached.
+    actions : sequence of Action
+        From `rig.plan.plan`, already checked.
+    log : LogWriter
+        Open; the engine writes rows, the caller attaches scene and protocol and finishes it.
+    gains : Gains
+        From the sensors' certificates.
+    stop : StopRequest
+        Set by signals; looked at once a turn.
+    progress : callable
+        ``progress(done_s, total_s, label)`` about five times a second of the bench's time.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        actions: Sequence[Action],
+        log: LogWriter,
+        gains: Gains,
+        stop: StopRequest,
+        progress: Callable[[float, float, str], None],
+    ) -> None:
+        self.bench = bench
+        self.clock = bench.clock
+        self.gains = gains
+        self.recorder = Recorder(log, self.clock, gains)
+        self.recorder.has_laser = bench.scene.displacement is not None
+        self.limits = Limits.of(bench.scene)
+        self.film = FilmLimits(bench.scene.specimen.specimen(), self.limits)
+        self.force_noise = math.nan
+        self.force_listener: Callable[[ForceSample, float], None] | None = None
+        self.displacement_listener: Callable[[DisplacementSample], None] | None = None
+        self._actions = actions
+        self._log = log
+        self._stop = stop
+        self._progress = progress
+        self._guard: Guard | None = None
+        self._nominal_voltage = 0.0
+        self._started = self.clock.now()
+        self._last_sample: dict[str, float] = {}
+        self._next_film_check = 0.0
+        self._next_progress = 0.0
+        self._watching = False
+
+    # What actions may do -------------------------------------------------------------------------------------
+
+    def command(self, device: str, command: str, argument: str) -> None:
+        """Write a command to the log before it is given."""
+        self.recorder.command(device, command, argument)
+
+    def move_stage(self, position: float, speed: float) -> None:
+        """Move the stage to ``position`` metres of its own scale."""
+        self.limits.speed.check(speed, "Stage speed")
+        self.command("stage", "move_to", f"{position * 1e3:.4f} mm at {speed * 1e3:g} mm/s")
+        self.bench.stage.move_to(position, speed)
+
+    def move_to(self, h: float, speed: float, voltage: float) -> None:
+        """Move the disk to displacement ``h`` metres, with the film checked along the way when there is HV."""
+        self.limits.displacement.check(h, "Displacement set-point")
+        if self._guard is not None:
+            film_checked(self, h, voltage)
+        self.recorder.target(h, voltage, speed)
+        self.move_stage(self.recorder.contact + h, speed)
+
+    def stop_stage(self) -> None:
+        """Decelerate to a standstill."""
+        self.command("stage", "stop", "")
+        self.bench.stage.stop()
+
+    def request_voltage(self, volts: float) -> None:
+        """Ask the guard for a voltage at the displacement where the film is; the first time arms it."""
+        if self._guard is None:
+            raise FaultError(f"{volts:g} V asked for, but the scene has no HV.")
+        if self._guard.state is GuardState.SAFE and self._guard.cause == "start":
+            self._guard.arm()
+        self.recorder.target(self.recorder.displacement, volts, 0.0)
+        self._guard.request(volts, self.recorder.displacement)
+        self._nominal_voltage = volts
+
+    # The run -------------------------------------------------------------------------------------------------
+
+    def run(self) -> tuple[Outcome, RigError | DeviceError | None]:
+        """Carry out the plan and leave the rig safe. The error, if any, is what ended the run."""
+        status, reason, error = "complete", "the protocol ended", None
+        try:
+            self.bench.attach(self.recorder.wire)
+            if self.bench.hv is not None:
+                ramp = self.bench.scene.hv.ramp_V_per_s if self.bench.scene.hv is not None else 0.0
+                tell = lambda command, argument: self.command("hv", command, argument)  # noqa: E731
+                self._guard = Guard(self.bench.hv, self.limits, self.film, ramp, tell)
+            self._set_up()
+            self._watching = True
+            self._carry_out_all()
+        except Stopped as caught:
+            status, reason, error = "stopped", str(caught), caught
+        except LimitError as caught:
+            status, reason, error = "limit", str(caught), caught
+        except (RigError, DeviceError) as caught:
+            status, reason, error = "fault", str(caught), caught
+        except BaseException as caught:
+            self._make_safe(f"internal error: {caught!r}", orderly=False)
+            raise
+        orderly = status in ("complete", "stopped")
+        if error is not None:
+            self.recorder.event("error", "engine", reason)
+        safe = self._make_safe(reason, orderly)
+        outcome = self._outcome(status, reason, safe)
+        return outcome, error
+
+    def _set_up(self) -> None:
+        """Poll until every driver has finished its set-up dialogue; then check who answered."""
+        end = self.clock.now() + SETUP_LIMIT_S
+        while not all(device.ready for device in self.bench.devices.values()):
+            self._turn()
+            if self.clock.now() > end:
+                waiting = [name for name, device in self.bench.devices.items() if not device.ready]
+                raise FaultError(f"{', '.join(waiting)}: not ready within {SETUP_LIMIT_S:.0f} s of set-up.")
+        for role, table in self.bench.scene.instruments.items():
+            device = self.bench.devices[role]
+            found = device.identity
+            settings = ", ".join(f"{key}={value}" for key, value in sorted(device.settings.items()))
+            self.recorder.event(
+                "info", role, f"model {found.model}, serial {found.serial}, firmware {found.firmware}; {settings}"
+            )
+            if table.serial is not None and table.serial != found.serial:
+                raise ConfigError(
+                    f"{role}: the scene names serial number {table.serial}, but {found.serial or 'no serial number'} "
+                    "answered. Are two instruments swapped? Nothing was moved and no output changed."
+                )
+        for role in self.bench.devices:
+            self._last_sample[role] = self.clock.now()
+
+    def _carry_out_all(self) -> None:
+        total = sum(action.duration for action in self._actions)
+        done = 0.0
+        for action in self._actions:
+            began = self.clock.now()
+            self._nominal_voltage = action.voltage[1]
+            self.recorder.phase(
+                {
+                    "step": action.step,
+                    "kind": action.kind,
+                    "label": action.label,
+                    "cycle": action.cycle,
+                    "direction": action.direction,
+                    "voltage_V": action.voltage[1],
+                    "record": action.record,
+                }
+            )
+            label = f"step {action.step} {action.kind}: {action.label}"
+            turns = carry_out(self, action)
+            for _ in turns:
+                if self.clock.now() >= self._next_progress:
+                    self._next_progress = self.clock.now() + 0.2
+                    self._progress(done + min(self.clock.now() - began, action.duration), total, label)
+                self._turn()
+            done += action.duration
+            self._progress(done, total, label)
+
+    def _turn(self) -> None:
+        """One turn of the loop: poll, judge, write, wait."""
+        if self._stop.count:
+            raise Stopped(f"stopped by {self._stop.source}")
+        now = self.clock.now()
+        for role, device in self.bench.devices.items():
+            for sample in device.poll(now):
+                self._take(role, sample, now)
+        if self._watching:
+            self._watch(now)
+        self._log.tick(now)
+        self.clock.sleep_until(self._next_turn(now))
+
+    def _next_turn(self, now: float) -> float:
+        wanted = min(device.next_poll for device in self.bench.devices.values())
+        return min(max(wanted, now + 0.001), now + TURN_S)
+
+    def _take(self, role: str, sample: Sample, now: float) -> None:
+        self.recorder.add(sample)
+        self._last_sample[role] = now
+        if isinstance(sample, ForceSample):
+            if self.force_listener is not None:
+                self.force_listener(sample, self.recorder.force)
+        elif isinstance(sample, DisplacementSample):
+            if self.displacement_listener is not None:
+                self.displacement_listener(sample)
+        elif isinstance(sample, HVSample) and self._guard is not None:
+            self._guard.on_sample(sample)
+
+    def _watch(self, now: float) -> None:
+        """Hold what was measured against the limits, and the age of every sensor against its rate."""
+        recorder = self.recorder
+        for role, period in self._periods().items():
+            age = now - self._last_sample[role]
+            if not age <= max(SILENCE_S, SILENCE_PERIODS * period):
+                raise FaultError(f"{role}: no sample for {age:.2f} s. Motion was stopped and the voltage taken down.")
+        if math.isfinite(recorder.force_zero):
+            self.limits.force.check(recorder.force, "Force measured")
+        if math.isfinite(recorder.contact):
+            self.limits.displacement.check(recorder.displacement, "Displacement measured")
+            live = self._guard is not None and self._guard.state is GuardState.LIVE
+            if live and now >= self._next_film_check:
+                self._next_film_check = now + FILM_CHECK_S
+                voltage = recorder.hv.voltage if recorder.hv is not None else math.nan
+                self.film.check(recorder.displacement, max(voltage, 0.0), "Film, as measured")
+
+    def _periods(self) -> dict[str, float]:
+        bench = self.bench
+        periods = {"stage": 1 / bench.scene.stage.poll_rate_Hz, "force": 1 / bench.force.rate}
+        if bench.displacement is not None:
+            periods["displacement"] = 1 / bench.displacement.rate
+        if bench.scene.hv is not None:
+            periods["hv"] = 1 / bench.scene.hv.poll_rate_Hz
+        return periods
+
+    # The end -------------------------------------------------------------------------------------------------
+
+    def _make_safe(self, cause: str, orderly: bool) -> bool:
+        """Stop the stage, take the voltage off, wait until that is measured. Returns whether it was.
+
+        An orderly end ramps down; a limit or fault takes the output off at once. A second signal turns a ramp into
+        an emergency off. A device that fails here is reported and does not keep the others from being made safe.
+        """
+        if not self.bench.devices:
+            return self.bench.scene.hv is None
+        guard = self._guard
+        if guard is not None:
+            try:
+                guard.ramp_off(cause) if orderly else guard.kill(cause)
+            except DeviceError as error:
+                self.recorder.event("error", "hv", str(error))
+        try:
+            self.stop_stage()
+        except DeviceError as error:
+            self.recorder.event("error", "stage", str(error))
+        hastened = not orderly
+        began = self.clock.now()
+        lost: set[str] = set()
+        while self.clock.now() < began + SAFE_LIMIT_S:
+            now = self.clock.now()
+            if guard is not None and not hastened and (self._stop.count >= 2 or "hv" in lost):
+                hastened = True
+                guard.kill(f"{cause}; hastened")
+            for role, device in self.bench.devices.items():
+                if role not in lost:
+                    self._poll_to_the_end(role, device.poll, now, lost)
+            still = "stage" in lost or not self.bench.stage.moving
+            off = guard is None or guard.output_is_safe or "hv" in lost
+            if still and off:
+                break
+            self._log.tick(now)
+            self.clock.sleep_until(self._next_turn(now))
+        safe = guard is None or (guard.output_is_safe and "hv" not in lost)
+        if guard is not None and not safe:
+            self.recorder.event(
+                "error",
+                "hv",
+                f"NOT SAFE: the output was not measured below {SAFE_VOLTAGE:.0f} V. Keep away; switch the supply off "
+                "at its mains switch and use the grounding stick.",
+            )
+        return safe
+
+    def _poll_to_the_end(
+        self, role: str, poll: Callable[[float], Sequence[Sample]], now: float, lost: set[str]
+    ) -> None:
+        try:
+            for sample in poll(now):
+                self.recorder.add(sample)
+                if isinstance(sample, HVSample) and self._guard is not None:
+                    self._guard.on_sample(sample)
+        except DeviceError as error:
+            lost.add(role)
+            self.recorder.event("error", role, str(error))
+        except RigError as error:  # a trip seen while already going down changes nothing
+            self.recorder.event("warning", role, str(error))
+
+    def _outcome(self, status: str, reason: str, safe: bool) -> Outcome:
+        recorder = self.recorder
+        return Outcome(
+            status=status,
+            reason=reason,
+            safe=safe,
+            voltage=recorder.hv.voltage if recorder.hv is not None else math.nan,
+            force=recorder.force,
+            position=recorder.stage.position if recorder.stage is not None else math.nan,
+            duration=self.clock.now() - self._started,
+        )

@@ -1,0 +1,220 @@
+"""From protocol steps to actions: what the engine will do, how long it takes, and what the model predicts of it.
+
+Every action goes from one displacement and voltage to another; that is what the limits are checked on before
+anything moves, and what the engine then carries out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from model.membrane import Status, solve_many
+from model.specimen import Specimen
+from rig import protocol as steps
+from rig.errors import LimitError
+from rig.safety.limits import Limits
+from rig.scene import Scene
+
+HOMING_S = 20.0  # only for the estimate: a long-travel stage at its homing speed
+POINTS = 13  # displacements per action at which the prediction is made
+
+
+@dataclass(frozen=True)
+class Action:
+    """One thing the engine does.
+
+    ``kind`` is the protocol step it came from. ``h`` and ``voltage`` are (before, after) in metres and volts;
+    ``speed`` in m/s for moves; ``duration`` is the expected time in seconds. ``record`` is True where the
+    samples are data of the film: the fit takes these.
+    """
+
+    step: int
+    kind: str
+    label: str
+    h: tuple[float, float]
+    voltage: tuple[float, float]
+    duration: float
+    speed: float = 0.0
+    cycle: int = 0
+    record: bool = False
+    parameters: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the stage moves along the film's axis, from one known displacement to another."""
+        return self.speed > 0 and self.h[0] != self.h[1]
+
+    @property
+    def direction(self) -> int:
+        """+1 loading, -1 unloading, 0 standing."""
+        return int(np.sign(self.h[1] - self.h[0])) if self.moves else 0
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The extremes that the model expects during one action, with the scene's guess of the material."""
+
+    peak_force: float
+    peak_field: float
+    minimum_hoop_stress: float
+    status: Status
+
+
+def plan(protocol: steps.Protocol, scene: Scene) -> list[Action]:
+    """All actions of ``protocol`` on ``scene``, in order.
+
+    Raises
+    ------
+    LimitError
+        When the protocol needs what the scene does not have (a voltage without ``[hv]``), or asks for steps in an
+        order that cannot work. Numerical limits are checked by `check_plan`.
+    """
+    return list(_actions(protocol, scene))
+
+
+def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
+    h, v = 0.0, 0.0
+    homed = zeroed = contact = False
+    ramp_rate = scene.hv.ramp_V_per_s if scene.hv is not None else float("inf")
+
+    def voltage_to(number: int, kind: str, target: float, settle: float) -> Action:
+        duration = abs(target - v) / ramp_rate + settle
+        label = f"voltage to {target:g} V"
+        return Action(number, kind, label, (h, h), (v, target), duration, parameters={"settle": settle})
+
+    def move_to(number: int, kind: str, target: float, speed: float, cycle: int, record: bool) -> Action:
+        label = f"{h * 1e3:g} to {target * 1e3:g} mm at {v:g} V"
+        duration = abs(target - h) / speed
+        return Action(number, kind, label, (h, target), (v, v), duration, speed, cycle, record)
+
+    for number, step in enumerate(protocol.step, start=1):
+        kind = step.do
+        wanted = max(getattr(step, "voltages_V", [0.0]) + [getattr(step, "voltage_V", 0.0)])
+        if wanted > 0 and scene.hv is None:
+            raise LimitError(f"Step {number} ({kind}) asks for {wanted:g} V, but the scene has no [hv] instrument.")
+        if kind in ("precondition", "ramp", "sweep", "voltage") and not contact:
+            raise LimitError(f"Step {number} ({kind}) needs the contact position: put an approach step before it.")
+        if isinstance(step, steps.Home):
+            if contact:
+                raise LimitError(f"Step {number} (home) would drive the stage with the specimen in contact.")
+            homed = True
+            yield Action(number, kind, "find the reference position", (0, 0), (0, 0), HOMING_S)
+        elif isinstance(step, steps.Zero):
+            if contact:
+                raise LimitError(f"Step {number} (zero) must come before the approach, with nothing touching.")
+            zeroed = True
+            yield Action(
+                number,
+                kind,
+                "average the unloaded sensors",
+                (0, 0),
+                (0, 0),
+                step.duration_s,
+                parameters={"duration": step.duration_s},
+            )
+        elif isinstance(step, steps.Approach):
+            if not (homed and zeroed):
+                raise LimitError(f"Step {number} (approach) needs a home and a zero step before it.")
+            contact = True
+            speed = step.speed_mm_per_s * 1e-3
+            yield Action(
+                number,
+                kind,
+                "advance to contact",
+                (0, 0),
+                (0, 0),
+                step.max_travel_mm * 1e-3 / speed,
+                speed,
+                parameters={"threshold": step.threshold_mN * 1e-3, "max_travel": step.max_travel_mm * 1e-3},
+            )
+        elif isinstance(step, steps.Precondition):
+            if v > 0:
+                raise LimitError(f"Step {number} (precondition) comes with {v:g} V on; put the voltage to 0 first.")
+            top = step.displacement_mm * 1e-3
+            for cycle in range(1, step.cycles + 1):
+                for target in (top, 0.0):
+                    yield move_to(number, kind, target, step.speed_mm_per_s * 1e-3, cycle, record=False)
+                    h = target
+        elif isinstance(step, steps.Ramp):
+            target = step.displacement_mm * 1e-3
+            yield move_to(number, kind, target, step.speed_mm_per_s * 1e-3, 0, record=True)
+            h = target
+        elif isinstance(step, steps.Hold):
+            label = f"hold {h * 1e3:g} mm, {v:g} V"
+            parameters = {"duration": step.duration_s}
+            yield Action(number, kind, label, (h, h), (v, v), step.duration_s, record=contact, parameters=parameters)
+        elif isinstance(step, steps.Voltage):
+            yield voltage_to(number, kind, step.voltage_V, step.settle_s)
+            v = step.voltage_V
+        elif isinstance(step, steps.Sweep):
+            start, top, speed = step.from_mm * 1e-3, step.displacement_mm * 1e-3, step.speed_mm_per_s * 1e-3
+            if not start < top:
+                raise LimitError(f"Step {number} (sweep): from_mm must be smaller than displacement_mm.")
+            for level in step.voltages_V:
+                if h != start:
+                    yield move_to(number, kind, start, speed, 0, record=False)
+                    h = start
+                if level != v:
+                    yield voltage_to(number, kind, level, step.settle_s)
+                    v = level
+                for cycle in range(1, step.cycles + 1):
+                    for target in (top, start):
+                        yield move_to(number, kind, target, speed, cycle, record=True)
+                        h = target
+            if v > 0:
+                yield voltage_to(number, kind, 0.0, step.settle_s)
+                v = 0.0
+        elif isinstance(step, steps.Return):
+            if v > 0:
+                yield voltage_to(number, kind, 0.0, 0.0)
+                v = 0.0
+            target = -step.clearance_mm * 1e-3 if contact else 0.0
+            speed = step.speed_mm_per_s * 1e-3
+            if contact:
+                yield Action(
+                    number, kind, "back from the film", (h, target), (0, 0), abs(target - h) / speed, speed
+                )
+            h, contact = 0.0, False
+
+
+def predict(action: Action, specimen: Specimen) -> Prediction:
+    """What the model expects during ``action``: extremes over its displacements at both of its voltages."""
+    h = np.linspace(max(action.h[0], 0.0), max(action.h[1], 0.0), POINTS if action.moves else 1)
+    voltage = np.array(sorted(set(action.voltage)))[:, None]
+    states = solve_many(specimen, h, voltage)
+    return Prediction(
+        peak_force=float(np.max(states.force)),
+        peak_field=float(np.max(states.peak_field)),
+        minimum_hoop_stress=float(np.min(states.min_hoop_stress)),
+        status=Status(int(np.max(states.status))),
+    )
+
+
+def check_plan(actions: list[Action], scene: Scene) -> list[Prediction]:
+    """Predict every action and hold it against the scene's limits.
+
+    Raises
+    ------
+    LimitError
+        Naming the step, the quantity, its value and its limit; NaN fails every limit.
+    """
+    limits = Limits.of(scene)
+    specimen = scene.specimen.specimen()
+    predictions = []
+    for action in actions:
+        where = f"Step {action.step} ({action.kind}, {action.label})"
+        limits.displacement.check(max(action.h), where)
+        limits.speed.check(action.speed, where)
+        for level in action.voltage:
+            limits.voltage.check(level, where)
+        prediction = predict(action, specimen)
+        limits.force.check(prediction.peak_force, f"{where}, predicted")
+        limits.field.check(prediction.peak_field, f"{where}, predicted")
+        limits.hoop_stress.check(prediction.minimum_hoop_stress, f"{where}, predicted")
+        if prediction.status is not Status.TAUT:
+            raise LimitError(f"{where}: the model has no taut state there ({prediction.status.message}).")
+        predictions.append(prediction)
+    return predictions

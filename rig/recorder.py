@@ -1,0 +1,147 @@
+"""What the engine knows of the bench right now, and the rows that it writes of it.
+
+Samples come in as the drivers give them; here they become newtons and metres by the sensors' certificates and the
+references taken during the run, and each is written with its raw reading beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample, StageSample
+from rig.clock import Clock
+
+if TYPE_CHECKING:
+    from rig.log.writer import LogWriter
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Quantity per reading of each sensor, from the certificates; 1.0 for a sensor that states SI itself."""
+
+    force: float = 1.0  # N per mV/V
+    displacement: float = 1.0
+    voltage: float = 1.0
+
+
+class Recorder:
+    """Turns samples into quantities, keeps the newest of each, and writes the log.
+
+    Attributes
+    ----------
+    force, displacement : float
+        Newest force (N) and displacement of the film (m); NaN until their references are known.
+    """
+
+    def __init__(self, log: LogWriter, clock: Clock, gains: Gains) -> None:
+        self._log = log
+        self._clock = clock
+        self._gains = gains
+        self.stage: StageSample | None = None
+        self.force_sample: ForceSample | None = None
+        self.displacement_sample: DisplacementSample | None = None
+        self.hv: HVSample | None = None
+        self.force_zero = math.nan
+        self.displacement_zero = math.nan
+        self.contact = math.nan
+        self.force = math.nan
+        self.has_laser = False
+
+    @property
+    def displacement(self) -> float:
+        """Displacement of the disk (m): by the laser where there is one, else stage position minus contact."""
+        if self.has_laser:
+            if self.displacement_sample is None:
+                return math.nan
+            return self.quantity_of(self.displacement_sample)
+        return math.nan if self.stage is None else self.stage.position - self.contact
+
+    def quantity_of(self, sample: ForceSample | DisplacementSample) -> float:
+        """Newtons or metres of one sample by certificate and reference."""
+        if isinstance(sample, ForceSample):
+            return self._gains.force * (sample.reading - self.force_zero)
+        return self._gains.displacement * (sample.displacement - self.displacement_zero)
+
+    def add(self, sample: Sample) -> None:
+        """Take in one sample and write it."""
+        match sample:
+            case ForceSample():
+                self.force_sample = sample
+                self.force = self.quantity_of(sample)
+                self._write(
+                    "/force/sample",
+                    sample.t,
+                    reading_mV_per_V=sample.reading,
+                    force_N=self.force,
+                    flags=sample.flags.value,
+                )
+            case StageSample():
+                self.stage = sample
+                self._write(
+                    "/stage/sample",
+                    sample.t,
+                    position_m=sample.position,
+                    moving=sample.moving,
+                    referenced=sample.referenced,
+                    raw_steps=sample.raw,
+                    warnings=" ".join(sample.warnings),
+                )
+            case DisplacementSample():
+                self.displacement_sample = sample
+                self._write(
+                    "/displacement/sample",
+                    sample.t,
+                    reading_m=sample.displacement,
+                    displacement_m=self.quantity_of(sample),
+                    flags=sample.flags.value,
+                )
+            case HVSample():
+                self.hv = sample
+                self._write(
+                    "/hv/sample",
+                    sample.t,
+                    voltage_V=sample.voltage * self._gains.voltage,
+                    current_A=sample.current,
+                    setpoint_V=sample.setpoint,
+                    flags=sample.flags.value,
+                )
+
+    def wire(self, role: str, way: Literal["rx", "tx"], data: bytes) -> None:
+        """Write bytes as they were on the wire."""
+        self._write(f"/raw/{role}/{way}", self._clock.now(), data=data)
+
+    def command(self, device: str, command: str, argument: str) -> None:
+        """Write a command; called before it is given."""
+        self._write("/command", self._clock.now(), device=device, command=command, argument=argument)
+
+    def event(self, severity: Literal["info", "warning", "error"], source: str, message: str) -> None:
+        """Write something that a reader of the log should know."""
+        self._write("/event", self._clock.now(), severity=severity, source=source, message=message)
+
+    def reference(self, name: str, value: float, standard_uncertainty: float, unit: str) -> None:
+        """Write a reference taken during the run (a zero, the contact position)."""
+        self._write(
+            "/reference",
+            self._clock.now(),
+            name=name,
+            value=value,
+            standard_uncertainty=standard_uncertainty,
+            unit=unit,
+        )
+
+    def phase(self, fields: Mapping[str, object]) -> None:
+        """Write the beginning of an action."""
+        self._write("/phase", self._clock.now(), **fields)
+
+    def target(self, displacement: float, voltage: float, speed: float) -> None:
+        """Write where the rig is being sent."""
+        self._write(
+            "/target", self._clock.now(), displacement_m=displacement, voltage_V=voltage, speed_m_per_s=speed
+        )
+
+    def _write(self, topic: str, t: float, **fields: object) -> None:
+        now = self._clock.now()
+        self._log.write(topic, {"t_s": t, **fields}, self._clock.epoch_ns(now), self._clock.epoch_ns(t))

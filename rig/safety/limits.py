@@ -1,0 +1,118 @@
+"""Limits, checked as ``lo <= x <= hi`` so that NaN fails every one of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from model.membrane import Status, solve
+from model.specimen import Specimen
+from rig.errors import LimitError
+from rig.scene import Scene
+
+# A monitor has noise and a gain error: a commanded voltage at its limit must not trip on them.
+MONITOR_V = 50.0
+MONITOR_GAIN = 1.03
+
+
+@dataclass(frozen=True)
+class Limit:
+    """An interval in SI units, with the words and scale in which the operator reads it."""
+
+    name: str
+    low: float
+    high: float
+    unit: str
+    per_si: float = 1.0
+
+    def holds(self, value: float) -> bool:
+        """Whether ``low <= value <= high``; False for NaN."""
+        return self.low <= value <= self.high
+
+    def check(self, value: float, where: str) -> None:
+        """Raise `LimitError` unless the value is inside.
+
+        Raises
+        ------
+        LimitError
+            Naming ``where``, the quantity, its value and what is allowed.
+        """
+        if not self.holds(value):
+            raise LimitError(f"{where}: {self.name} {self._text(value)} is outside {self.allowed}.")
+
+    @property
+    def allowed(self) -> str:
+        """The interval as text with its unit."""
+        if self.high == math.inf:
+            return f"the limit (at least {self._text(self.low)})"
+        if self.low == -math.inf:
+            return f"the limit (at most {self._text(self.high)})"
+        return f"the limits ({self.low * self.per_si:g} to {self._text(self.high)})"
+
+    def _text(self, value: float) -> str:
+        return f"{value * self.per_si:.4g} {self.unit}"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """All limits of one scene."""
+
+    force: Limit
+    displacement: Limit
+    speed: Limit
+    voltage: Limit
+    measured_voltage: Limit
+    current: Limit
+    field: Limit
+    hoop_stress: Limit
+
+    @classmethod
+    def of(cls, scene: Scene) -> Limits:
+        """The limits in ``scene``; the field's is the smaller of the scene's and the material's breakdown field.
+
+        A scene without HV allows 0 V only.
+        """
+        table = scene.limits
+        breakdown = scene.specimen.specimen().material.breakdown_field
+        candidates = [breakdown] if breakdown is not None else []
+        if table.field_V_per_um is not None:
+            candidates.append(table.field_V_per_um * 1e6)
+        force, travel = table.force_N, table.displacement_mm * 1e-3
+        voltage = table.voltage_V if table.voltage_V is not None else 0.0
+        current = table.current_uA * 1e-6 if table.current_uA is not None else 0.0
+        return cls(
+            force=Limit("force", -force, force, "N"),
+            displacement=Limit("displacement", -math.inf, travel, "mm", 1e3),
+            speed=Limit("speed", 0.0, table.speed_mm_per_s * 1e-3, "mm/s", 1e3),
+            voltage=Limit("voltage", 0.0, voltage, "V"),
+            measured_voltage=Limit("voltage", -MONITOR_V, voltage * MONITOR_GAIN + MONITOR_V, "V"),
+            current=Limit("current", -current, current, "uA", 1e6),
+            field=Limit("field", 0.0, min(candidates, default=math.inf), "V/um", 1e-6),
+            hoop_stress=Limit("hoop stress", table.minimum_hoop_stress_kPa * 1e3, math.inf, "kPa", 1e-3),
+        )
+
+
+class FilmLimits:
+    """Field and tension of the *deformed* film for a pair (displacement, voltage), by the model.
+
+    A voltage that is allowed on the flat film may be too much on the stretched one, and a displacement that is
+    allowed without voltage may not be with it; so the pair is checked before either changes.
+    """
+
+    def __init__(self, specimen: Specimen, limits: Limits) -> None:
+        self._specimen = specimen
+        self._limits = limits
+
+    def check(self, h: float, voltage: float, where: str) -> None:
+        """Raise unless the film at ``h`` metres and ``voltage`` volts is taut and below its field limit.
+
+        Raises
+        ------
+        LimitError
+            Naming ``where`` and the quantity that does not hold.
+        """
+        state = solve(self._specimen, max(h, 0.0), voltage)
+        self._limits.field.check(state.peak_field, where)
+        self._limits.hoop_stress.check(state.min_hoop_stress, where)
+        if state.status is not Status.TAUT:
+            raise LimitError(f"{where}: the model has no taut state there ({state.status.message}).")

@@ -1,0 +1,227 @@
+"""The scene: which specimen, which instruments, which limits. A TOML file with units in its key names.
+
+A scene pays only for what it names: without ``[hv]`` there is no guard, no CAN and no electrostatics; without
+``[displacement]`` the stage's own position is the displacement. Instruments with a port are real hardware (or a
+simulated bench in another process); a scene in which no instrument has a port runs on the simulated bench in memory.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from model.materials import NAMED, Material
+from model.specimen import Specimen
+from rig.errors import ConfigError
+from rig.sim.settings import SimulationSettings
+from rig.table import Table
+from rig.toml_file import load_table
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class MaterialTable(Table):
+    """Ogden terms in the convention W = sum mu_n/alpha_n (l1^a + l2^a + (l1 l2)^-a - 3), and the permittivity."""
+
+    mu_Pa: list[float] = Field(min_length=1, max_length=6)
+    alpha: list[float] = Field(min_length=1, max_length=6)
+    eps_r: float = Field(default=1.0, ge=1.0)
+    breakdown_V_per_um: Positive | None = None
+    max_stretch: float | None = Field(default=None, gt=1.0)
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _same_length(self) -> Self:
+        if len(self.mu_Pa) != len(self.alpha):
+            raise ValueError(f"mu_Pa has {len(self.mu_Pa)} terms and alpha {len(self.alpha)}; they must pair up")
+        return self
+
+    def material(self, name: str) -> Material:
+        """The same in SI units."""
+        field = None if self.breakdown_V_per_um is None else self.breakdown_V_per_um * 1e6
+        return Material(
+            name=name,
+            mu=tuple(self.mu_Pa),
+            alpha=tuple(self.alpha),
+            eps_r=self.eps_r,
+            breakdown_field=field,
+            max_stretch=self.max_stretch,
+            source=self.source,
+        )
+
+
+class SpecimenTable(Table):
+    """The film as mounted. The material is what is believed of it: it plans and guards, the fit starts from it."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")
+    disk_radius_mm: Positive
+    ring_radius_mm: Positive
+    thickness_um: Positive
+    prestretch: float = Field(ge=1.0, le=6.0)
+    material: str | MaterialTable
+
+    @model_validator(mode="after")
+    def _sensible(self) -> Self:
+        if not self.disk_radius_mm < self.ring_radius_mm:
+            raise ValueError("disk_radius_mm must be smaller than ring_radius_mm")
+        if isinstance(self.material, str) and self.material not in NAMED:
+            raise ValueError(f"material {self.material!r} is not known; known are {', '.join(sorted(NAMED))}")
+        return self
+
+    def specimen(self) -> Specimen:
+        """The specimen in SI units."""
+        known = self.material
+        material = NAMED[known] if isinstance(known, str) else known.material(f"{self.name} (scene)")
+        return Specimen(
+            disk_radius=self.disk_radius_mm * 1e-3,
+            ring_radius=self.ring_radius_mm * 1e-3,
+            thickness=self.thickness_um * 1e-6,
+            prestretch=self.prestretch,
+            material=material,
+            name=self.name,
+        )
+
+
+class LimitsTable(Table):
+    """What may never be exceeded, by command or by measurement."""
+
+    force_N: Positive
+    displacement_mm: Positive
+    speed_mm_per_s: Positive
+    voltage_V: Positive | None = None
+    current_uA: Positive | None = None
+    field_V_per_um: Positive | None = None
+    minimum_hoop_stress_kPa: float = 0.0
+
+
+class SerialTable(Table):
+    """What every instrument on a serial port has."""
+
+    port: str | None = Field(default=None, min_length=1)
+    serial: str | None = None
+    certificate: str | None = None
+
+
+class ZaberTable(SerialTable):
+    """A Zaber stage on its ASCII protocol."""
+
+    driver: Literal["zaber"]
+    baud: int = Field(default=115200, gt=0)
+    device: int = Field(default=1, ge=1, le=99)
+    axis: int = Field(default=1, ge=1, le=9)
+    poll_rate_Hz: float = Field(default=50.0, gt=0, le=200)
+
+
+class GSV8Table(SerialTable):
+    """An ME-Messsysteme GSV-8 with a strain-gauge force sensor; its certificate turns mV/V into newtons."""
+
+    driver: Literal["gsv8"]
+    baud: int = Field(default=230400, gt=0)
+    channel: int = Field(default=1, ge=1, le=8)
+    rate_Hz: float = Field(default=100.0, gt=0, le=2000)
+    certificate: str
+
+
+class KeyenceTable(SerialTable):
+    """A Keyence LK-G laser displacement sensor on RS-232."""
+
+    driver: Literal["keyence-lkg"]
+    baud: int = Field(default=115200, gt=0)
+    output: int = Field(default=1, ge=1, le=2)
+    poll_rate_Hz: float = Field(default=50.0, gt=0, le=200)
+
+
+class IsegTable(Table):
+    """One channel of an iseg supply that speaks EDCP on CAN."""
+
+    driver: Literal["iseg-edcp"]
+    interface: Literal["slcan", "socketcan", "pcan", "vector", "virtual", "udp_multicast"] | None = None
+    can_channel: str | None = None
+    bitrate: int = Field(default=125_000, gt=0)
+    module: int = Field(default=0, ge=0, le=63)
+    channel: int = Field(default=0, ge=0, le=23)
+    ramp_V_per_s: Positive = 100.0
+    poll_rate_Hz: float = Field(default=10.0, gt=0, le=50)
+    serial: str | None = None
+    certificate: str | None = None
+
+    @model_validator(mode="after")
+    def _pair(self) -> Self:
+        if (self.interface is None) != (self.can_channel is None):
+            raise ValueError("interface and can_channel belong together: give both or neither")
+        return self
+
+
+class Scene(Table):
+    """Everything about the bench for one specimen. See the module's docstring."""
+
+    title: str = ""
+    specimen: SpecimenTable
+    limits: LimitsTable
+    stage: ZaberTable
+    force: GSV8Table
+    displacement: KeyenceTable | None = None
+    hv: IsegTable | None = None
+    simulation: SimulationSettings | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        named = [role for role, table in self.instruments.items() if is_connected(table)]
+        if named and len(named) < len(self.instruments):
+            missing = [role for role in self.instruments if role not in named]
+            raise ValueError(f"{', '.join(named)} has a port but {', '.join(missing)} has none; name all or none")
+        if not named and self.simulation is None:
+            raise ValueError("no instrument has a port and there is no [simulation] table: nothing to run on")
+        if self.hv is not None and (self.limits.voltage_V is None or self.limits.current_uA is None):
+            raise ValueError("a scene with [hv] must give limits.voltage_V and limits.current_uA")
+        if self.hv is None and self.limits.voltage_V is not None:
+            raise ValueError("limits.voltage_V is given but there is no [hv] instrument")
+        return self
+
+    @cached_property
+    def instruments(self) -> dict[str, ZaberTable | GSV8Table | KeyenceTable | IsegTable]:
+        """The instruments that the scene names, by role, in the order in which they are polled."""
+        tables = {"stage": self.stage, "force": self.force, "displacement": self.displacement, "hv": self.hv}
+        return {role: table for role, table in tables.items() if table is not None}
+
+    @property
+    def on_real_ports(self) -> bool:
+        """True when the instruments are reached through ports, False for the simulated bench in memory."""
+        return is_connected(self.stage)
+
+    def with_ports(self, ports: dict[str, dict[str, Any]]) -> Scene:
+        """The same scene with the ports that ``dea-rig sim`` printed.
+
+        Raises
+        ------
+        ConfigError
+            When a role is missing from ``ports`` or a port's keys are not those of the instrument.
+        """
+        raw = self.model_dump(exclude_none=True)
+        for role in self.instruments:
+            if role not in ports:
+                raise ConfigError(f"The ports name no {role!r}; they name {', '.join(sorted(ports)) or 'nothing'}.")
+            raw[role].update(ports[role])
+        try:
+            return Scene.model_validate(raw)
+        except ValueError as error:
+            raise ConfigError(f"The ports do not fit the scene: {error}") from None
+
+
+def is_connected(table: Table) -> bool:
+    """Whether this instrument's table names a port or bus."""
+    return getattr(table, "port", None) is not None or getattr(table, "interface", None) is not None
+
+
+def load_scene(path: Path) -> tuple[Scene, str]:
+    """The scene in ``path`` and its exact text.
+
+    Raises
+    ------
+    ConfigError
+        Naming file, key, value and what is allowed.
+    """
+    return load_table(path, Scene, "scene")
