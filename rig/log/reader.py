@@ -1,0 +1,341 @@
+"""Reads a log: finished, cut short, damaged or hostile. Data with an explicit list of gaps, or one `LogError`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from rig.log import schema
+from rig.log.errors import LogError
+from rig.log.scan import MAX_TABLES, ChannelInfo, Damaged, Gap, Record, Scan, Source, chunk_content, messages
+
+Columns = dict[str, NDArray[Any]]
+
+
+class Message(NamedTuple):
+    """One message: when the host had it, the time that it is about (ns since 1970), its fields."""
+
+    log_ns: int
+    publish_ns: int
+    fields: dict[str, Any]
+
+
+class Attachment(NamedTuple):
+    """A file inside the log. Its name is the log's claim and must not be used as a path."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+class _Chunk(NamedTuple):
+    record: Record
+    topics: dict[int, str]  # of the channels that have messages in it
+
+
+@dataclass(frozen=True)
+class Log:
+    """What a log holds. Samples are decoded when they are asked for.
+
+    Attributes
+    ----------
+    path : Path
+    topics : dict of str to int
+        Messages that can be read on each topic, in the order of the table in `rig.log.schema`.
+    missing : dict of str to int
+        Messages known to be lost on each topic, by their sequence numbers; nothing is known behind the last one read.
+    unknown : dict of str to int
+        Messages on topics that are not in the table; they are not decoded.
+    attachments : dict of str to Attachment
+    metadata : dict of str to dict
+        ``run``, ``versions``, ``host``, ``outcome``, ... as written.
+    gaps : tuple of Gap
+        Bytes that could not be read, and why.
+    start_ns, end_ns : int
+        Log time of the first and the last message; 0 when there is none.
+    ended : bool
+        Whether the file has its end record, that is, was closed by its writer.
+    """
+
+    path: Path
+    topics: dict[str, int]
+    missing: dict[str, int]
+    unknown: dict[str, int]
+    attachments: dict[str, Attachment]
+    metadata: dict[str, dict[str, str]]
+    gaps: tuple[Gap, ...]
+    start_ns: int
+    end_ns: int
+    ended: bool
+    _chunks: tuple[_Chunk, ...]
+
+    @property
+    def outcome(self) -> dict[str, str] | None:
+        """Why and how the run ended; None when the log was cut short."""
+        return self.metadata.get("outcome")
+
+    @property
+    def whole(self) -> bool:
+        """Whether everything that was written can be read."""
+        return self.ended and not self.gaps and not self.missing
+
+    def messages(self, topic: str) -> Iterator[Message]:
+        """The messages on one topic in the order of the file; none when the topic is not in the log."""
+        for _, log_ns, publish_ns, payload in self._payloads({topic}):
+            yield Message(log_ns, publish_ns, self._decode(topic, payload))
+
+    def columns(self, topic: str) -> Columns:
+        """The messages on one topic as arrays of shape (n,): ``log_ns``, ``publish_ns`` and every field by its name.
+
+        Numbers are float64, int64, uint32, int32 or bool; text and bytes are object arrays.
+        """
+        return self.tables([topic])[topic]
+
+    def tables(self, topics: Collection[str]) -> dict[str, Columns]:
+        """`columns` of several topics, in one pass over the file."""
+        rows: dict[str, tuple[list[int], list[int], list[bytes]]] = {topic: ([], [], []) for topic in topics}
+        for topic, log_ns, publish_ns, payload in self._payloads(set(topics)):
+            log_times, publish_times, payloads = rows[topic]
+            log_times.append(log_ns)
+            publish_times.append(publish_ns)
+            payloads.append(payload)
+        return {
+            topic: {
+                "log_ns": np.array(log_times, dtype=np.int64),
+                "publish_ns": np.array(publish_times, dtype=np.int64),
+                **self._fields(topic, payloads),
+            }
+            for topic, (log_times, publish_times, payloads) in rows.items()
+        }
+
+    def _payloads(self, topics: set[str]) -> Iterator[tuple[str, int, int, bytes]]:
+        unknown = topics - schema.CHANNELS.keys()
+        if unknown:
+            raise LogError(self.path, f"no log has a topic {', '.join(sorted(unknown))}")
+        with Source(self.path) as source:
+            for chunk in self._chunks:
+                wanted = {number: topic for number, topic in chunk.topics.items() if topic in topics}
+                if not wanted:
+                    continue
+                try:
+                    content = chunk_content(source, chunk.record)
+                    described = dict.fromkeys(chunk.topics, ChannelInfo("", "", "", b""))
+                    for message in messages(content, described):
+                        topic = wanted.get(message.channel)
+                        if topic is not None:
+                            payload = content[message.start : message.end]
+                            yield topic, message.log_ns, message.publish_ns, payload
+                except Damaged as why:
+                    raise LogError(self.path, f"changed while it was read ({why})", "Read it again.") from why
+
+    def _decode(self, topic: str, payload: bytes) -> dict[str, Any]:
+        try:
+            return schema.decode(topic, payload)
+        except ValueError as error:
+            raise LogError(self.path, str(error), "Another program wrote it, or wrote into it.") from error
+
+    def _fields(self, topic: str, payloads: list[bytes]) -> Columns:
+        n = len(payloads)
+        columns: Columns = {
+            field.name: np.empty(n, dtype=_NUMPY[field.type]) for field in schema.CHANNELS[topic].fields
+        }
+        fast = np.zeros(n, dtype=bool)
+        packing = _packing(topic)
+        if packing is not None:
+            fast = packing.unpack(payloads, columns)
+        for row in np.flatnonzero(~fast):
+            for name, value in self._decode(topic, payloads[row]).items():
+                columns[name][row] = value
+        return columns
+
+
+def read_log(path: Path) -> Log:
+    """Read the log at ``path``, finished or not (``.part``), checking every checksum.
+
+    Raises
+    ------
+    LogError
+        The file cannot be read, is not a log, or was written with another schema version.
+    """
+    with Source(path) as source:
+        return _read(source)
+
+
+def _read(source: Source) -> Log:
+    scan = Scan(source)
+    tally = _Tally(source.path)
+    attachments: dict[str, Attachment] = {}
+    metadata: dict[str, dict[str, str]] = {}
+    chunks: list[_Chunk] = []
+    for record in scan.records():
+        try:
+            if record.opcode == Opcode.CHUNK:
+                chunks.append(_Chunk(record, tally.add(scan.chunk(record))))
+            elif record.opcode == Opcode.ATTACHMENT:
+                attachment = Attachment(*scan.attachment(record))
+                _check_new(attachments, attachment.name)
+                attachments[attachment.name] = attachment
+            elif record.opcode == Opcode.METADATA:
+                name, table = scan.metadata(record)
+                _check_new(metadata, name)
+                metadata[name] = table
+        except Damaged as why:
+            scan.damaged(record, str(why))
+    if not tally.counts.keys() & schema.CHANNELS.keys() and "log" not in metadata:
+        raise LogError(source.path, "holds nothing that dea-rig wrote", "Name a log of dea-rig.")
+    return Log(
+        path=source.path,
+        topics={topic: tally.counts[topic] for topic in schema.CHANNELS if topic in tally.counts},
+        missing={topic: tally.missing[topic] for topic in schema.CHANNELS if topic in tally.missing},
+        unknown={topic: count for topic, count in tally.counts.items() if topic not in schema.CHANNELS},
+        attachments=attachments,
+        metadata=metadata,
+        gaps=tuple(scan.gaps),
+        start_ns=tally.start_ns or 0,
+        end_ns=tally.end_ns,
+        ended=scan.ended,
+        _chunks=tuple(chunks),
+    )
+
+
+class _Tally:
+    """Counts the messages of sound chunks and those that are missing between them."""
+
+    def __init__(self, path: Path) -> None:
+        self.counts: dict[str, int] = {}
+        self.missing: dict[str, int] = {}
+        self.start_ns: int | None = None
+        self.end_ns = 0
+        self._path = path
+        self._channels: dict[int, ChannelInfo] = {}
+        self._checked: set[ChannelInfo] = set()
+        self._sequence: dict[str, int] = {}
+
+    def add(self, content: bytes) -> dict[int, str]:
+        """Count a chunk; the topics of its channels by number. Raises `Damaged`, and then counts nothing of it."""
+        count: dict[int, int] = {}
+        last: dict[int, int] = {}
+        first_ns, last_ns = 2**63, 0
+        for channel, sequence, log_ns, publish_ns, _, _ in messages(content, self._channels):
+            count[channel] = count.get(channel, 0) + 1
+            last[channel] = sequence
+            first_ns, last_ns = min(first_ns, log_ns), max(last_ns, log_ns)
+            if publish_ns >= 2**63:
+                raise Damaged("a chunk with an impossible time")
+        if last_ns >= 2**63:
+            raise Damaged("a chunk with an impossible time")
+        for channel in count:
+            self._check_schema(self._channels[channel])
+        for channel, n in count.items():
+            topic = self._channels[channel].topic
+            lost = last[channel] - self._sequence.get(topic, 0) - n
+            if lost > 0:
+                self.missing[topic] = self.missing.get(topic, 0) + lost
+            self.counts[topic] = self.counts.get(topic, 0) + n
+            self._sequence[topic] = last[channel]
+        if count:
+            self.start_ns = first_ns if self.start_ns is None else min(self.start_ns, first_ns)
+            self.end_ns = max(self.end_ns, last_ns)
+        return {channel: self._channels[channel].topic for channel in count}
+
+    def _check_schema(self, channel: ChannelInfo) -> None:
+        if channel in self._checked or channel.topic not in schema.CHANNELS:
+            return
+        expected = ("protobuf", schema.schema_name(channel.topic), schema.schema_data(channel.topic))
+        if (channel.encoding, channel.schema_name, channel.schema_data) != expected:
+            raise LogError(
+                self._path,
+                f"the messages on {channel.topic} are of another kind than those of schema version "
+                f"{schema.SCHEMA_VERSION}",
+                "Read it with the version of dea-rig that wrote it; its metadata names it.",
+            )
+        self._checked.add(channel)
+
+
+def _check_new(found: dict[str, Any], name: str) -> None:
+    if name in found:
+        raise Damaged(f"a second {name!r}")
+    if len(found) >= MAX_TABLES:
+        raise Damaged(f"more than {MAX_TABLES} of its kind")
+
+
+_NUMPY = {
+    "double": np.dtype("<f8"),
+    "bool": np.dtype("?"),
+    "fixed32": np.dtype("<u4"),
+    "sfixed64": np.dtype("<i8"),
+    "uint32": np.dtype("<u4"),
+    "sint32": np.dtype("<i4"),
+    "string": np.dtype("O"),
+    "bytes": np.dtype("O"),
+}
+_WIRE_TYPE = {"double": 1, "bool": 0, "fixed32": 5, "sfixed64": 1, "string": 2}
+
+
+class _Packing(NamedTuple):
+    """How a message lies in its bytes when its texts are empty."""
+
+    layout: np.dtype[Any]  # the numbers
+    fixed: dict[int, int]  # offset and value of the bytes that are always the same
+    bools: list[str]
+    texts: list[str]
+
+    def unpack(self, payloads: list[bytes], columns: Columns) -> NDArray[np.bool_]:
+        """Fill the rows of ``columns`` whose payload lies like this, all at once; which rows those are."""
+        size = self.layout.itemsize
+        fits = np.fromiter((len(payload) == size for payload in payloads), dtype=bool, count=len(payloads))
+        data = np.frombuffer(b"".join([payload for payload in payloads if len(payload) == size]), dtype=np.uint8)
+        data = data.reshape(-1, size)
+        sound = np.ones(len(data), dtype=bool)
+        for offset, value in self.fixed.items():
+            sound &= data[:, offset] == value
+        numbers = data.view(self.layout)[:, 0]
+        for name in self.bools:
+            sound &= numbers[name] <= 1
+        fits[fits] = sound
+        for name in self.layout.names or ():
+            columns[name][fits] = numbers[name][sound]
+        for name in self.texts:
+            columns[name][fits] = ""
+        return fits
+
+
+@cache
+def _packing(topic: str) -> _Packing | None:
+    """The packing of the messages on ``topic``; None when a field has no fixed size."""
+    fields = schema.CHANNELS[topic].fields
+    if any(field.type not in _WIRE_TYPE for field in fields):
+        return None
+    kinds: dict[str, tuple[np.dtype[Any], int]] = {}
+    fixed: dict[int, int] = {}
+    size = 0
+    for number, field in enumerate(fields, 1):
+        fixed[size] = number << 3 | _WIRE_TYPE[field.type]
+        size += 1
+        if field.type == "string":
+            fixed[size] = 0
+            size += 1
+        else:
+            kind = np.dtype("u1") if field.type == "bool" else _NUMPY[field.type]
+            kinds[field.name] = kind, size
+            size += kind.itemsize
+    return _Packing(
+        np.dtype(
+            {
+                "names": list(kinds),
+                "formats": [kind for kind, _ in kinds.values()],
+                "offsets": [offset for _, offset in kinds.values()],
+                "itemsize": size,
+            }
+        ),
+        fixed,
+        [field.name for field in fields if field.type == "bool"],
+        [field.name for field in fields if field.type == "string"],
+    )

@@ -1,0 +1,242 @@
+"""The channels of a log: one table, from which the protobuf descriptors and the documentation both follow.
+
+Every message has explicit field presence (proto2 ``optional``), and `encode` writes every field. A message whose
+strings are empty therefore has a fixed size, and a column of a million samples can be read without a loop. Field
+numbers follow the order of the table, from 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Flag
+from functools import cache
+from typing import Any, NamedTuple
+
+from google.protobuf.descriptor import Descriptor
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
+
+from drivers.roles import HVFlag, SampleFlag
+
+SCHEMA_VERSION = 1
+PACKAGE = "dearig.v1"
+ROLES = ("stage", "force", "displacement", "hv")
+
+
+class Field(NamedTuple):
+    """One field of a message: its name with the unit in it, its protobuf type, its meaning."""
+
+    name: str
+    type: str
+    meaning: str
+
+
+class Channel(NamedTuple):
+    """The message that a topic carries."""
+
+    message: str
+    fields: tuple[Field, ...]
+
+
+def _flag_values(flags: type[Flag]) -> str:
+    return ", ".join(f"{flag.value} {flag.name}" for flag in flags)
+
+
+_T = Field("t_s", "double", "clock time, seconds since the start of the run")
+_FLAGS = Field("flags", "fixed32", f"what is wrong with the sample, a sum of: {_flag_values(SampleFlag)}")
+_RAW = Channel(
+    "RawBytes",
+    (_T, Field("data", "bytes", "as on the wire; a CAN frame is its identifier (2 bytes, big-endian) and its data")),
+)
+
+CHANNELS: dict[str, Channel] = {
+    "/stage/sample": Channel(
+        "StageSample",
+        (
+            _T,
+            Field("position_m", "double", "position of the stage in metres, in the device's own coordinate"),
+            Field("moving", "bool", "true while a motion command is under way"),
+            Field("referenced", "bool", "true once the stage has been homed"),
+            Field("raw_steps", "sfixed64", "position in the device's own steps"),
+            Field("warnings", "string", "the device's warning codes, separated by spaces"),
+        ),
+    ),
+    "/force/sample": Channel(
+        "ForceSample",
+        (
+            _T,
+            Field("reading_mV_per_V", "double", "bridge reading in millivolts per volt; NaN when there is no value"),
+            Field("force_N", "double", "force on the film in newtons, zero and sensitivity applied"),
+            _FLAGS,
+        ),
+    ),
+    "/displacement/sample": Channel(
+        "DisplacementSample",
+        (
+            _T,
+            Field("reading_m", "double", "displacement as the sensor states it, in metres; NaN when there is no value"),
+            Field("displacement_m", "double", "out-of-plane displacement of the film in metres, zero applied"),
+            _FLAGS,
+        ),
+    ),
+    "/hv/sample": Channel(
+        "HvSample",
+        (
+            _T,
+            Field("voltage_V", "double", "measured output voltage in volts"),
+            Field("current_A", "double", "measured output current in amperes"),
+            Field("setpoint_V", "double", "set-point read back from the supply, in volts"),
+            Field("flags", "fixed32", f"state of the channel, a sum of: {_flag_values(HVFlag)}"),
+        ),
+    ),
+    "/target": Channel(
+        "Target",
+        (
+            _T,
+            Field("displacement_m", "double", "out-of-plane displacement asked for, in metres"),
+            Field("voltage_V", "double", "voltage asked for, in volts"),
+            Field("speed_m_per_s", "double", "speed of the stage asked for, in metres per second"),
+        ),
+    ),
+    "/phase": Channel(
+        "Phase",
+        (
+            _T,
+            Field("step", "uint32", "index of the protocol step that begins here"),
+            Field("kind", "string", "kind of the step: home, zero, approach, ramp, ..."),
+            Field("label", "string", "the step's own name in the protocol, or its kind"),
+            Field("cycle", "uint32", "cycle within the step, from 0"),
+            Field("direction", "sint32", "+1 loading, -1 unloading, 0 neither"),
+            Field("voltage_V", "double", "nominal voltage of the step, in volts"),
+            Field("record", "bool", "true while the samples are meant for identification"),
+        ),
+    ),
+    "/reference": Channel(
+        "Reference",
+        (
+            _T,
+            Field("name", "string", "force_zero, displacement_zero, contact_position, ..."),
+            Field("value", "double", "the reference, in `unit`"),
+            Field("standard_uncertainty", "double", "its standard uncertainty, in `unit`"),
+            Field("unit", "string", "unit of value and uncertainty"),
+        ),
+    ),
+    "/command": Channel(
+        "Command",
+        (
+            _T,
+            Field("device", "string", "the device's name in the scene"),
+            Field("command", "string", "what is about to be asked of it"),
+            Field("argument", "string", "with what, unit included"),
+        ),
+    ),
+    "/event": Channel(
+        "Event",
+        (
+            _T,
+            Field("severity", "string", "info, warning or error"),
+            Field("source", "string", "who says so"),
+            Field("message", "string", "what happened"),
+        ),
+    ),
+    **{f"/raw/{role}/{way}": _RAW for role in ROLES for way in ("rx", "tx")},
+}
+
+_TYPES = {
+    "double": FieldDescriptorProto.TYPE_DOUBLE,
+    "bool": FieldDescriptorProto.TYPE_BOOL,
+    "fixed32": FieldDescriptorProto.TYPE_FIXED32,
+    "sfixed64": FieldDescriptorProto.TYPE_SFIXED64,
+    "uint32": FieldDescriptorProto.TYPE_UINT32,
+    "sint32": FieldDescriptorProto.TYPE_SINT32,
+    "string": FieldDescriptorProto.TYPE_STRING,
+    "bytes": FieldDescriptorProto.TYPE_BYTES,
+}
+
+
+def schema_name(topic: str) -> str:
+    """Full protobuf name of the message on ``topic``, e.g. ``dearig.v1.ForceSample``."""
+    return f"{PACKAGE}.{CHANNELS[topic].message}"
+
+
+@cache
+def schema_data(topic: str) -> bytes:
+    """The serialised FileDescriptorSet that describes the message on ``topic``."""
+    return FileDescriptorSet(file=[_file(CHANNELS[topic])]).SerializeToString(deterministic=True)
+
+
+def encode(topic: str, fields: Mapping[str, Any]) -> bytes:
+    """The protobuf bytes of one message with all its fields.
+
+    Raises
+    ------
+    KeyError
+        No such topic.
+    ValueError
+        A field is missing, unknown, or of the wrong type.
+    """
+    cls, names = _coder(topic)
+    if fields.keys() != names:
+        missing, unknown = sorted(names - fields.keys()), sorted(fields.keys() - names)
+        parts = [f"{what} {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]
+        raise ValueError(f"{topic}: fields {'; '.join(parts)}")
+    if None in fields.values():  # protobuf would leave the field out
+        raise ValueError(f"{topic}: a field is None")
+    try:
+        return cls(**fields).SerializeToString()
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{topic}: {error}") from error
+
+
+def decode(topic: str, data: bytes) -> dict[str, Any]:
+    """The fields of one message, in the order of the table.
+
+    Raises
+    ------
+    KeyError
+        No such topic.
+    ValueError
+        The bytes are not such a message, a field is missing, or a text is not UTF-8.
+    """
+    cls, names = _coder(topic)
+    try:
+        message = cls.FromString(data)
+    except DecodeError as error:
+        raise ValueError(f"{topic}: not a {CHANNELS[topic].message} message") from error
+    if len(message.ListFields()) != len(names):
+        raise ValueError(f"{topic}: a {CHANNELS[topic].message} message without all its fields")
+    fields = {field.name: getattr(message, field.name) for field in CHANNELS[topic].fields}
+    for field in CHANNELS[topic].fields:
+        if field.type == "string" and not isinstance(fields[field.name], str):  # protobuf gives bytes then
+            raise ValueError(f"{topic}: {field.name} is not UTF-8")
+    return fields
+
+
+def _file(channel: Channel) -> FileDescriptorProto:
+    fields = [
+        FieldDescriptorProto(
+            name=field.name, number=number, type=_TYPES[field.type], label=FieldDescriptorProto.LABEL_OPTIONAL
+        )
+        for number, field in enumerate(channel.fields, 1)
+    ]
+    return FileDescriptorProto(
+        name=f"{PACKAGE}.{channel.message}.proto",
+        package=PACKAGE,
+        message_type=[DescriptorProto(name=channel.message, field=fields)],
+    )
+
+
+@cache
+def _pool() -> DescriptorPool:
+    pool = DescriptorPool()
+    for channel in {channel.message: channel for channel in CHANNELS.values()}.values():
+        pool.Add(_file(channel))
+    return pool
+
+
+@cache
+def _coder(topic: str) -> tuple[type[Message], frozenset[str]]:
+    descriptor: Descriptor = _pool().FindMessageTypeByName(schema_name(topic))
+    return GetMessageClass(descriptor), frozenset(field.name for field in CHANNELS[topic].fields)

@@ -1,0 +1,72 @@
+"""A small log of everything that a log can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rig.log.writer import LogWriter
+
+START_NS = 1_577_836_800_000_000_000
+
+# One message of every topic but the raw ones; the values are awkward on purpose.
+SAMPLES: dict[str, dict[str, Any]] = {
+    "/stage/sample": {
+        "position_m": 1.5e-3,
+        "moving": True,
+        "referenced": False,
+        "raw_steps": -31496,
+        "warnings": "WR FQ",
+    },
+    "/force/sample": {"reading_mV_per_V": -0.0, "force_N": 0.1, "flags": 4},
+    "/displacement/sample": {"reading_m": 0.0, "displacement_m": 5e-324, "flags": 0},
+    "/hv/sample": {"voltage_V": 1499.75, "current_A": 1e-9, "setpoint_V": 1500.0, "flags": 1023},
+    "/target": {"displacement_m": 2e-3, "voltage_V": 1500.0, "speed_m_per_s": 1e-4},
+    "/phase": {
+        "step": 3,
+        "kind": "sweep",
+        "label": "up · 1500 V",
+        "cycle": 1,
+        "direction": -1,
+        "voltage_V": 1500.0,
+        "record": True,
+    },
+    "/reference": {"name": "force_zero", "value": 0.0123, "standard_uncertainty": 1e-5, "unit": "mV/V"},
+    "/command": {"device": "stage", "command": "move_to", "argument": "2.0 mm"},
+    "/event": {"severity": "warning", "source": "force", "message": "“over range”"},
+    "/raw/hv/rx": {"data": b"\x02\x58\x00\xff"},
+}
+
+
+def write_small(path: Path, n: int = 20) -> None:
+    """``n`` rounds of `SAMPLES`, 40 ms apart, with an attachment, metadata and an outcome."""
+    with LogWriter(path) as log:
+        log.attach("scene.toml", "application/toml", b'title = "small"\n')
+        log.metadata("run", {"scene": "small"})
+        for k in range(n):
+            t = k * 0.04
+            ns = START_NS + k * 40_000_000
+            for topic, fields in SAMPLES.items():
+                log.write(topic, {"t_s": t, **fields}, ns + 7, ns)
+            log.tick(t)
+        log.finish({"reason": "complete"})
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    path = tmp_path / "small.mcap"
+    write_small(path)
+    return path
+
+
+@pytest.fixture
+def write_log() -> Callable[[Path, int], None]:
+    return write_small
+
+
+@pytest.fixture
+def samples() -> dict[str, dict[str, Any]]:
+    return SAMPLES

@@ -1,0 +1,94 @@
+import math
+import struct
+
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+from rig.log import schema
+
+
+def test_bytes_on_the_wire():
+    """Tags, order and presence, spelled out by hand from the protobuf encoding rules."""
+    data = schema.encode("/force/sample", {"t_s": 1.0, "reading_mV_per_V": 0.0, "force_N": -2.5, "flags": 3})
+    expected = (
+        b"\x09" + struct.pack("<d", 1.0)
+        + b"\x11" + struct.pack("<d", 0.0)  # zeros are written, so that nothing is guessed at reading
+        + b"\x19" + struct.pack("<d", -2.5)
+        + b"\x25" + struct.pack("<I", 3)
+    )  # fmt: skip
+    assert data == expected
+
+
+def test_every_topic_round_trips(samples):
+    for topic, fields in samples.items():
+        fields = {"t_s": 0.25, **fields}
+        decoded = schema.decode(topic, schema.encode(topic, fields))
+        assert decoded == fields
+        assert list(decoded) == [field.name for field in schema.CHANNELS[topic].fields]
+    assert {t for t in schema.CHANNELS if not t.startswith("/raw")} == {t for t in samples if not t.startswith("/raw")}
+
+
+def test_nan_and_infinity_survive():
+    fields = {"t_s": math.inf, "reading_mV_per_V": math.nan, "force_N": -math.inf, "flags": 0}
+    decoded = schema.decode("/force/sample", schema.encode("/force/sample", fields))
+    assert decoded["t_s"] == math.inf
+    assert math.isnan(decoded["reading_mV_per_V"])
+    assert decoded["force_N"] == -math.inf
+
+
+GOOD = {"t_s": 0.0, "reading_mV_per_V": 0.0, "force_N": 0.0, "flags": 0}
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {**GOOD, "force_N": "1"},
+        {**GOOD, "flags": -1},
+        {**GOOD, "flags": 1.5},
+        {**GOOD, "flags": 2**32},
+        {**GOOD, "force_N": None},
+        {**GOOD, "force_mN": 1.0},
+        {k: v for k, v in GOOD.items() if k != "flags"},
+        {},
+    ],
+)
+def test_wrong_fields_are_refused(bad):
+    with pytest.raises(ValueError, match="/force/sample"):
+        schema.encode("/force/sample", bad)
+
+
+def test_text_that_is_not_unicode_is_refused():
+    with pytest.raises(ValueError, match="/event"):
+        schema.encode("/event", {"t_s": 0.0, "severity": "info", "source": "x", "message": "\ud800"})
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\xff", b"\x09\x00", schema.encode("/force/sample", GOOD)[:-5], b"\x0d\x00\x00\x80\x3f"],
+    ids=["empty", "junk", "cut", "field missing", "wrong wire type"],
+)
+def test_what_is_not_a_message_is_refused(data):
+    with pytest.raises(ValueError, match="/force/sample"):
+        schema.decode("/force/sample", data)
+
+
+def test_text_that_is_not_utf8_is_refused():
+    event = schema.encode("/event", {"t_s": 0.0, "severity": "info", "source": "x", "message": "abc"})
+    with pytest.raises(ValueError, match="message is not UTF-8"):
+        schema.decode("/event", event.replace(b"abc", b"\xff\xfe\xfd"))
+
+
+def test_units_stand_in_the_names():
+    """Every double says its unit, but for a reference, which carries it in a field of its own."""
+    units = ("_s", "_m", "_N", "_V", "_A", "_mV_per_V", "_m_per_s")
+    for topic, channel in schema.CHANNELS.items():
+        for field in channel.fields:
+            if field.type == "double" and topic != "/reference":
+                assert field.name.endswith(units), f"{topic}.{field.name}"
+
+
+def test_descriptor_sets_stand_alone():
+    for topic in schema.CHANNELS:
+        (file,) = FileDescriptorSet.FromString(schema.schema_data(topic)).file
+        assert f"{file.package}.{file.message_type[0].name}" == schema.schema_name(topic)
+        assert not file.dependency
