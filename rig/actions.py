@@ -106,9 +106,10 @@ def _approach(engine: Engine, action: Action) -> Turns:
             f"Step {action.step} (approach): threshold {threshold * 1e3:.3g} mN is lost in the force noise; "
             f"give threshold_mN of at least {needed * 1e3:.2g}."
         )
-    start = recorder.stage
-    assert start is not None
-    goal = min(start.position + action.parameters["max_travel"], stage.travel[1])
+    start = action.parameters["start"]
+    engine.move_stage(start, action.parameters["fast"])
+    yield from _wait(engine, lambda: not stage.moving, _patience(action), "The stage's way to where approaching begins")
+    goal = min(start + action.parameters["max_travel"], stage.travel[1])
     positions: list[float] = []
     forces: list[float] = []
 

@@ -1,11 +1,171 @@
-"""The command line: thin commands over the rooms of the house."""
+"""The command line: thin commands over the rooms of the house.
+
+Heavy things are imported inside the commands that use them, so that ``dea-rig --help`` answers at once.
+"""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 import click
 
+FILE = click.Path(path_type=Path, dir_okay=False)
 
-@click.group()
+
+class Commands(click.Group):
+    """A group in which an error for the operator is a message and an exit code, never a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except BrokenPipeError:
+            ctx.exit(1)
+        except Exception as error:
+            code = _exit_code(error)
+            if code is None:
+                raise
+            click.secho(str(error), err=True, fg="red")
+            for note in getattr(error, "__notes__", []):
+                click.echo(note, err=True)
+            ctx.exit(code)
+
+
+def _exit_code(error: Exception) -> int | None:
+    """The exit code of an error that is meant for the operator; None for a mistake of ours."""
+    from drivers.link import DeviceError
+    from rig.errors import RigError
+
+    if isinstance(error, RigError):
+        return error.exit_code
+    return 4 if isinstance(error, DeviceError) else None
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="dea-rig")
 def main() -> None:
-    """Characterise conical dielectric elastomer actuators on a bench, real or simulated."""
+    """Characterise conical dielectric elastomer actuators on a bench, real or simulated.
+
+    Start with `dea-rig demo`. Software is not the safety function: interlock, emergency stop, current limit and
+    bleed resistor are.
+    """
+
+
+@main.command()
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Directory to make; default dea-rig-demo.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the simulation.")
+def demo(out: Path | None, seed: int) -> None:
+    """Characterise two simulated specimens, start to finish, and compare with the truth."""
+    from rig.demo import run_demo
+
+    run_demo(out, seed)
+
+
+@main.command()
+@click.argument("scene", type=FILE)
+@click.argument("protocol", type=FILE)
+def check(scene: Path, protocol: Path) -> None:
+    """Validate SCENE and PROTOCOL and print the plan with what the model predicts. Touches no hardware."""
+    from rig.experiment import prepare
+    from rig.tables import plan_table, show
+
+    experiment = prepare(scene, protocol)
+    show(plan_table(experiment))
+
+
+@main.command()
+@click.argument("scene", type=FILE)
+@click.argument("protocol", type=FILE)
+@click.option("-o", "--out", type=FILE, required=True, help="Log to write; never overwrites.")
+@click.option("--ports", type=FILE, help="Ports by role as `dea-rig sim` prints them; in place of the scene's.")
+@click.option("--arm", is_flag=True, help="Allow high voltage on real ports; asks once more unless --yes.")
+@click.option("--yes", is_flag=True, help="Answer that question with yes: for unattended simulated benches.")
+def run(scene: Path, protocol: Path, out: Path, ports: Path | None, arm: bool, yes: bool) -> None:
+    """Run PROTOCOL on the bench of SCENE and log every byte. Ctrl-C ends it safely."""
+    from rig.errors import ConfigError
+    from rig.experiment import prepare
+    from rig.experiment import run as run_experiment
+    from rig.progress import progress
+
+    experiment = prepare(scene, protocol, _read_ports(ports) if ports is not None else None)
+    if experiment.scene.on_real_ports and experiment.scene.hv is not None:
+        highest = max(max(action.voltage) for action in experiment.actions)
+        if highest > 0 and not arm:
+            raise ConfigError(f"This run goes up to {highest:g} V on a real port. If that is meant, add --arm.")
+        if highest > 0 and not yes:
+            click.confirm(
+                f"High voltage up to {highest:g} V. Lid closed, interlock closed, nobody touching the specimen?",
+                abort=True,
+            )
+    with progress(f"{experiment.scene.specimen.name}: {experiment.protocol.title}") as update:
+        outcome = run_experiment(experiment, out, update)
+    click.echo(f"{out}: {outcome.reason} after {outcome.duration:.0f} s; {outcome.state}.")
+
+
+@main.command()
+@click.argument("scene", type=FILE)
+def sim(scene: Path) -> None:
+    """Serve the simulated bench of SCENE on pseudo-terminals until stopped; prints the ports as JSON."""
+    from rig.bench import simulated_bench
+    from rig.clock import RealClock
+    from rig.scene import load_scene
+    from rig.signals import stop_on_signals
+    from rig.sim.server import Server
+
+    loaded, _ = load_scene(scene)
+    server = Server(simulated_bench(loaded), RealClock())
+    with stop_on_signals() as stop:
+        try:
+            click.echo(json.dumps(server.ports))
+            server.run(lambda: stop.count > 0)
+        finally:
+            server.close()
+
+
+@main.command()
+@click.argument("logs", nargs=-1, required=True, type=FILE)
+@click.option("-o", "--out", type=FILE, help="Result as JSON.")
+@click.option("--report", type=FILE, help="Result as one self-contained HTML page.")
+@click.option("--terms", type=click.IntRange(1, 3), default=2, show_default=True, help="Ogden terms.")
+def fit(logs: tuple[Path, ...], out: Path | None, report: Path | None, terms: int) -> None:
+    """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties."""
+    from rig.identification import identify_logs, write_results
+    from rig.tables import identification_table, show
+
+    found = identify_logs(list(logs), terms=terms)
+    write_results(found, out, report)
+    show(identification_table(found.identification))
+    for path in (out, report):
+        if path is not None:
+            click.echo(f"written: {path}")
+
+
+@main.command()
+@click.argument("log", type=FILE)
+@click.option("--save", type=FILE, help="Write a Rerun recording instead of opening the viewer.")
+@click.option("--screenshot", type=FILE, help="Write a picture instead of opening the viewer; needs no display.")
+def view(log: Path, save: Path | None, screenshot: Path | None) -> None:
+    """Open LOG in the Rerun viewer, on this machine only."""
+    from rig.view import view as view_log
+
+    view_log(log, save=save, screenshot=screenshot)
+    for path in (save, screenshot):
+        if path is not None:
+            click.echo(f"written: {path}")
+
+
+def _read_ports(path: Path) -> dict[str, dict[str, Any]]:
+    from rig.errors import ConfigError
+    from rig.toml_file import read_text
+
+    text = click.get_text_stream("stdin").read() if str(path) == "-" else read_text(path, "ports")
+    try:
+        ports = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not the JSON that `dea-rig sim` prints: {error}.") from None
+    if not isinstance(ports, dict) or not all(isinstance(value, dict) for value in ports.values()):
+        raise ConfigError(f"{path}: not the JSON that `dea-rig sim` prints: a table of ports by role is needed.")
+    return ports

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Protocol
 
 # Virtual runs are stamped as if they began here, so that their logs are the same whenever they are made.
@@ -70,3 +71,8 @@ class VirtualClock:
 
     def epoch_ns(self, t: float) -> int:
         return VIRTUAL_EPOCH_NS + round(t * 1e9)
+
+
+def calendar_now() -> datetime:
+    """The host's date and time (UTC): a host fact, never part of what a run does."""
+    return datetime.now(UTC)

@@ -49,6 +49,13 @@ class Outcome:
     position: float
     duration: float
 
+    @property
+    def state(self) -> str:
+        """The state of the output, in words for the operator."""
+        if math.isnan(self.voltage):
+            return "no high voltage in this scene" if self.safe else "high voltage NOT SAFE: never measured"
+        return f"high voltage {'off' if self.safe else 'NOT SAFE'}, measured {self.voltage:.0f} V"
+
     def as_text(self) -> dict[str, str]:
         """As the log's metadata: text only, units in the names."""
         return {
@@ -101,7 +108,6 @@ class Engine:
         self.force_listener: Callable[[ForceSample, float], None] | None = None
         self.displacement_listener: Callable[[DisplacementSample], None] | None = None
         self._actions = actions
-        self._log = log
         self._stop = stop
         self._progress = progress
         self._guard: Guard | None = None
@@ -237,7 +243,7 @@ class Engine:
                 self._take(role, sample, now)
         if self._watching:
             self._watch(now)
-        self._log.tick(now)
+        self.recorder.tick(now)
         self.clock.sleep_until(self._next_turn(now))
 
     def _next_turn(self, now: float) -> float:
@@ -317,7 +323,7 @@ class Engine:
             off = guard is None or guard.output_is_safe or "hv" in lost
             if still and off:
                 break
-            self._log.tick(now)
+            self.recorder.tick(now)
             self.clock.sleep_until(self._next_turn(now))
         safe = guard is None or (guard.output_is_safe and "hv" not in lost)
         if guard is not None and not safe:

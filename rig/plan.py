@@ -119,16 +119,22 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
             if not (homed and zeroed):
                 raise LimitError(f"Step {number} (approach) needs a home and a zero step before it.")
             contact = True
-            speed = step.speed_mm_per_s * 1e-3
+            speed, fast = step.speed_mm_per_s * 1e-3, scene.limits.speed_mm_per_s * 1e-3
+            start, travel = scene.stage.approach_from_mm * 1e-3, step.max_travel_mm * 1e-3
             yield Action(
                 number,
                 kind,
                 "advance to contact",
                 (0, 0),
                 (0, 0),
-                step.max_travel_mm * 1e-3 / speed,
+                start / fast + travel / speed,
                 speed,
-                parameters={"threshold": step.threshold_mN * 1e-3, "max_travel": step.max_travel_mm * 1e-3},
+                parameters={
+                    "threshold": step.threshold_mN * 1e-3,
+                    "start": start,
+                    "fast": fast,
+                    "max_travel": travel,
+                },
             )
         elif isinstance(step, steps.Precondition):
             if v > 0:

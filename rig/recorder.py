@@ -7,12 +7,14 @@ references taken during the run, and each is written with its raw reading beside
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample, StageSample
 from rig.clock import Clock
+from rig.log.errors import LogError
 
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
@@ -49,6 +51,7 @@ class Recorder:
         self.contact = math.nan
         self.force = math.nan
         self.has_laser = False
+        self.log_failed = False
 
     @property
     def displacement(self) -> float:
@@ -142,6 +145,23 @@ class Recorder:
             "/target", self._clock.now(), displacement_m=displacement, voltage_V=voltage, speed_m_per_s=speed
         )
 
+    def tick(self, now: float) -> None:
+        """Let the log send what is due to its file."""
+        if not self.log_failed:
+            with self._failing_once():
+                self._log.tick(now)
+
     def _write(self, topic: str, t: float, **fields: object) -> None:
-        now = self._clock.now()
-        self._log.write(topic, {"t_s": t, **fields}, self._clock.epoch_ns(now), self._clock.epoch_ns(t))
+        if not self.log_failed:
+            epoch_ns = self._clock.epoch_ns
+            with self._failing_once():
+                self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), epoch_ns(t))
+
+    @contextmanager
+    def _failing_once(self) -> Iterator[None]:
+        """The first error of the log ends the run; after it the way to the safe state goes on unrecorded."""
+        try:
+            yield
+        except LogError:
+            self.log_failed = True
+            raise

@@ -113,6 +113,7 @@ class ZaberTable(SerialTable):
     device: int = Field(default=1, ge=1, le=99)
     axis: int = Field(default=1, ge=1, le=9)
     poll_rate_Hz: float = Field(default=50.0, gt=0, le=200)
+    approach_from_mm: float = Field(default=0.0, ge=0)  # stage position, short of the film, where approaching begins
 
 
 class GSV8Table(SerialTable):

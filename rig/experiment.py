@@ -1,0 +1,165 @@
+"""One experiment: scene and protocol in, a finished log out, whatever happens in between."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+
+from calibration.certificate import Certificate, CertificateError, load_certificate
+from rig.bench import Bench
+from rig.clock import Clock, calendar_now
+from rig.engine import Engine, Outcome
+from rig.errors import ConfigError
+from rig.log.writer import LogWriter
+from rig.plan import Action, Prediction, check_plan, plan
+from rig.protocol import Protocol, load_protocol
+from rig.recorder import Gains
+from rig.scene import Scene, load_scene
+from rig.signals import stop_on_signals
+
+RECORDED_PACKAGES = ("dea-rig", "numpy", "scipy", "mcap", "protobuf", "pydantic", "pyserial", "python-can")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A scene and a protocol that fit each other, with the certificates of the scene's sensors.
+
+    Everything that can be found wrong without touching hardware has been looked for once this exists.
+    """
+
+    scene: Scene
+    scene_text: str
+    protocol: Protocol
+    protocol_text: str
+    certificates: dict[str, Certificate]
+    actions: list[Action]
+    predictions: list[Prediction]
+
+    @property
+    def duration(self) -> float:
+        """Planned duration in seconds."""
+        return sum(action.duration for action in self.actions)
+
+
+def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, object]] | None = None) -> Experiment:
+    """Load and check everything; touches no hardware.
+
+    Parameters
+    ----------
+    ports : dict, optional
+        Ports by role as ``dea-rig sim`` prints them; they take the place of the scene's own.
+
+    Raises
+    ------
+    ConfigError, LimitError
+        With the file, key or step, the value and what is allowed.
+    """
+    scene, scene_text = load_scene(scene_path)
+    if ports is not None:
+        scene = scene.with_ports(ports)
+    protocol, protocol_text = load_protocol(protocol_path)
+    certificates = _certificates(scene, scene_path.parent)
+    actions = plan(protocol, scene)
+    return Experiment(
+        scene, scene_text, protocol, protocol_text, certificates, actions, check_plan(actions, scene)
+    )
+
+
+def run(experiment: Experiment, out: Path, progress: Callable[[float, float, str], None]) -> Outcome:
+    """Carry the experiment out and leave a finished log at ``out``.
+
+    Returns the outcome of a run that ended as planned.
+
+    Raises
+    ------
+    RigError, drivers.link.DeviceError
+        What ended the run early; the rig has been made safe and the log finished by then, and the error carries the
+        outcome as a note.
+    """
+    bench = Bench(experiment.scene)
+    try:
+        problems = _check_dates(experiment.certificates, bench.clock)
+        with LogWriter(out) as log, stop_on_signals() as stop:
+            _attach(log, experiment, problems)
+            engine = Engine(bench, experiment.actions, log, _gains(experiment.certificates), stop, progress)
+            outcome, error = engine.run()
+            if not engine.recorder.log_failed:
+                log.finish(outcome.as_text())
+    finally:
+        bench.close()
+    if error is not None:
+        error.add_note(_how_it_ended(outcome))
+        error.add_note(f"The log so far: {out if out.exists() else log.part}")
+        raise error
+    return outcome
+
+
+def _how_it_ended(outcome: Outcome) -> str:
+    """The state of the rig, for the operator."""
+    advice = "" if outcome.safe else " Keep away, switch the supply off at its mains switch, use the grounding stick."
+    return f"The stage was told to stop; {outcome.state}.{advice}"
+
+
+def _certificates(scene: Scene, folder: Path) -> dict[str, Certificate]:
+    found = {}
+    for role, table in scene.instruments.items():
+        if table.certificate is None:
+            continue
+        try:
+            certificate = load_certificate(folder / table.certificate)
+        except CertificateError as error:
+            raise ConfigError(f"{role}.certificate: {error}.") from None
+        if certificate.role != role:
+            raise ConfigError(
+                f"{role}.certificate = {table.certificate!r}: this certificate is for the role {certificate.role!r}."
+            )
+        found[role] = certificate
+    return found
+
+
+def _check_dates(certificates: dict[str, Certificate], clock: Clock) -> list[str]:
+    """Problems with the certificates' dates; serial numbers are checked once the instruments have answered."""
+    today = datetime.fromtimestamp(clock.epoch_ns(clock.now()) * 1e-9, UTC).date()
+    return [problem for certificate in certificates.values() for problem in certificate.check("", today)]
+
+
+def _gains(certificates: dict[str, Certificate]) -> Gains:
+    gain = {role: certificate.gain for role, certificate in certificates.items()}
+    return Gains(gain.get("force", 1.0), gain.get("displacement", 1.0), gain.get("hv", 1.0))
+
+
+def _attach(log: LogWriter, experiment: Experiment, problems: list[str]) -> None:
+    """What a reader needs to understand the run; first in the file, so that it survives whatever comes."""
+    log.attach("scene.toml", "application/toml", experiment.scene_text.encode())
+    log.attach("protocol.toml", "application/toml", experiment.protocol_text.encode())
+    for role, certificate in experiment.certificates.items():
+        log.attach(f"certificate.{role}.toml", "application/toml", certificate.raw)
+    uncalibrated = [role for role in experiment.scene.instruments if role not in experiment.certificates]
+    log.metadata(
+        "run",
+        {
+            "scene": experiment.scene.title,
+            "protocol": experiment.protocol.title,
+            "specimen": experiment.scene.specimen.name,
+            "bench": "real ports" if experiment.scene.on_real_ports else "simulated in memory",
+            "without_certificate": " ".join(role for role in uncalibrated if role != "stage"),
+            "certificate_problems": "; ".join(problems),
+        },
+    )
+    log.metadata("versions", {name: metadata.version(name) for name in RECORDED_PACKAGES})
+    log.metadata(
+        "host",
+        {
+            "python": sys.version.split()[0],
+            "system": platform.system(),
+            "machine": platform.machine(),
+            "started": calendar_now().isoformat(timespec="seconds"),
+        },
+    )
+
+
