@@ -1,0 +1,124 @@
+"""The film's law at a point: true stresses and tangent moduli in logarithmic stretches.
+
+With ``L_i = ln l_i`` the Ogden energy of a pre-stretched film under the voltage ``V`` is
+
+    W*(L1, L2) = sum mu_n/al_n (e^(al_n L1) + e^(al_n L2) + e^(-al_n (L1+L2)) - 3) - (k/2) e^(2 (L1+L2)),
+    k = eps (V/T)^2
+
+and its gradient is the true stress: ``dW*/dL_i = sigma_i = sum mu_n (l_i^al_n - (l1 l2)^-al_n) - k l1^2 l2^2``.
+Logarithms and ``expm1`` keep every digit of a stress at strains of 1e-16, and make the second derivatives sums of
+powers already at hand. Stresses are in units of the shear modulus.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Evaluations:
+    """How many points each part of the law was evaluated at: what a state pays for."""
+
+    mechanical: int = 0
+    electric: int = 0
+    relaxed: int = 0
+
+
+@dataclass(slots=True)
+class Film:
+    """Material numbers of a block of states, the states along the last axis.
+
+    mu, alpha : (terms, S) or, when all states share them, (terms, 1); mu in units of G
+    field : ``eps (V/T)^2 / G`` of shape (S,), or None when no state has a voltage
+    """
+
+    mu: Array
+    alpha: Array
+    field: Array | None
+    count: Evaluations
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Film:
+        """The states at ``index``."""
+        shared = self.mu.shape[1] == 1
+        return Film(
+            mu=self.mu if shared else self.mu[:, index],
+            alpha=self.alpha if shared else self.alpha[:, index],
+            field=None if self.field is None else self.field[index],
+            count=self.count,
+        )
+
+    def powers(self, log_stretch: Array) -> Array:
+        """``exp(al_n X) - 1`` of every term, (terms, 3, points, S), where ``log_stretch`` stacks L1, L2, -(L1+L2)."""
+        exponents: Array = self.alpha.reshape(self.alpha.shape[0], 1, 1, -1) * log_stretch
+        return np.expm1(exponents, out=exponents)
+
+    def sums(self, powers: Array) -> tuple[Array, Array]:
+        """``sum mu_n (l^al_n - 1)`` and ``sum mu_n al_n l^al_n`` of L1, L2, -(L1+L2), each (3, points, S)."""
+        self.count.mechanical += powers.shape[2] * powers.shape[3]
+        stiffness = self.mu * self.alpha
+        if self.mu.shape[1] == 1:
+            flat = powers.reshape(powers.shape[0], -1)
+            both = (np.hstack((self.mu, stiffness)).T @ flat).reshape((2, *powers.shape[1:]))
+            stress, modulus = both[0], both[1]
+        else:
+            stress = self.mu[0] * powers[0]
+            modulus = stiffness[0] * powers[0]
+            for n in range(1, powers.shape[0]):
+                stress += self.mu[n] * powers[n]
+                modulus += stiffness[n] * powers[n]
+        modulus += 2.0  # sum mu_n al_n = 2 G, the unit of stress
+        return stress, modulus
+
+    def maxwell(self, log_stretch: Array) -> Array:
+        """Maxwell stress ``k l1^2 l2^2`` (points, S)."""
+        assert self.field is not None
+        self.count.electric += log_stretch.shape[1] * log_stretch.shape[2]
+        stress: Array = self.field * np.exp(-2.0 * log_stretch[2])
+        return stress
+
+
+def stack(log1: Array, log2: Array) -> Array:
+    """L1, L2, L3 = -(L1+L2), of shape (3, points, S)."""
+    out = np.empty((3, *log1.shape))
+    out[0] = log1
+    out[1] = log2
+    np.add(log1, log2, out=out[2])
+    np.negative(out[2], out=out[2])
+    return out
+
+
+@dataclass(slots=True)
+class Stress:
+    """Stresses and tangent moduli in logarithmic stretch at points (points, S), units of G."""
+
+    t1: Array
+    t2: Array
+    h11: Array
+    h12: Array
+    h22: Array
+    maxwell: Array | None
+
+
+def stress(film: Film, log_stretch: Array) -> Stress:
+    """True stress ``dW*/dL_i`` and tangent ``d2W*/dL_i dL_j`` at stacked log stretches (3, points, S)."""
+    m, a = film.sums(film.powers(log_stretch))
+    t1 = m[0] - m[2]
+    t2 = m[1] - m[2]
+    h11 = a[0] + a[2]
+    h22 = a[1] + a[2]
+    h12 = a[2]
+    if film.field is None:
+        return Stress(t1, t2, h11, h12, h22, None)
+    b = film.maxwell(log_stretch)
+    t1 -= b
+    t2 -= b
+    b2 = 2.0 * b
+    h11 -= b2
+    h12 -= b2
+    h22 -= b2
+    return Stress(t1, t2, h11, h12, h22, b)

@@ -1,0 +1,392 @@
+"""Force, stresses and field of a conical film at a displacement and a voltage, with a status and an error estimate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.ladder import Answer, climb
+from model.law import Array, Evaluations, Film, stack, stress
+from model.ritz import Problem
+from model.specimen import Specimen
+
+Wrinkling = Literal["plain", "tension_field"]
+BLOCK = 512  # states solved together: their arrays stay in the processor's cache
+
+
+class Status(IntEnum):
+    """What kind of answer a state has. Only TAUT and WRINKLED carry a force; elsewhere it is NaN."""
+
+    TAUT = 0
+    WRINKLED = 1
+    SLACK = 2
+    UNSTABLE = 3
+    NOT_CONVERGED = 4
+    INVALID = 5
+
+    @property
+    def message(self) -> str:
+        """One sentence for the operator."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.TAUT: "The film is in tension everywhere.",
+    Status.WRINKLED: "Hoop tension is lost somewhere: the film wrinkles there; the plain equations do not describe it.",
+    Status.SLACK: "The voltage has taken all tension out of the film: it hangs slack and no membrane answer exists.",
+    Status.UNSTABLE: "No stable state on the branch that starts at 0 V: this is beyond pull-in.",
+    Status.NOT_CONVERGED: "The solver found no solution to the tolerance asked for.",
+    Status.INVALID: "The input does not describe a film: see the reason given.",
+}
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """Answers to an array of states; every array has the broadcast shape S of the inputs.
+
+    Where ``status`` is neither TAUT nor WRINKLED the numbers are NaN.
+
+    Attributes
+    ----------
+    force : F (N), positive when it pushes the disk to positive h
+    peak_field, peak_field_radius : largest true field (V/m) and the undeformed radius R where it stands (m)
+    min_hoop_stress, min_meridional_stress : smallest true stresses (Pa)
+    max_stretch : largest principal stretch in the film's plane
+    status : `Status` numbers
+    error_estimate : estimated relative error of the force
+    iterations : Newton iterations spent
+    modes : resolution reached
+    stable : the energy has a minimum here
+    field_exceeded, stretch_exceeded : above the material's stated limits (False where it states none)
+    dforce : derivatives of the force with respect to "h", "voltage", "disk_radius", "ring_radius", "thickness",
+        "prestretch", "eps_r" (shape S) and "mu", "alpha" (shape S + (terms,)); None unless asked for
+    evaluations : how many points of the material's law were computed
+    """
+
+    force: Array
+    peak_field: Array
+    peak_field_radius: Array
+    min_hoop_stress: Array
+    min_meridional_stress: Array
+    max_stretch: Array
+    status: NDArray[np.int8]
+    error_estimate: Array
+    iterations: NDArray[np.intp]
+    modes: NDArray[np.intp]
+    stable: NDArray[np.bool_]
+    field_exceeded: NDArray[np.bool_]
+    stretch_exceeded: NDArray[np.bool_]
+    dforce: dict[str, Array] | None = None
+    evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.force.shape
+
+    @property
+    def answered(self) -> NDArray[np.bool_]:
+        """Where there is a force."""
+        return self.status <= Status.WRINKLED
+
+    @property
+    def tension_margin(self) -> Array:
+        """The smaller of the two least stresses (Pa): negative when tension is lost."""
+        return np.minimum(self.min_hoop_stress, self.min_meridional_stress)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The answer to one state; the attributes are those of `Solutions`, as plain numbers."""
+
+    specimen: Specimen
+    h: float
+    voltage: float
+    force: float
+    peak_field: float
+    peak_field_radius: float
+    min_hoop_stress: float
+    min_meridional_stress: float
+    max_stretch: float
+    status: Status
+    error_estimate: float
+    iterations: int
+    modes: int
+    stable: bool
+    field_exceeded: bool
+    stretch_exceeded: bool
+    dforce: dict[str, Any] | None = None
+    evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
+    state: tuple[Array, Array] | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def answered(self) -> bool:
+        """Whether there is a force."""
+        return self.status <= Status.WRINKLED
+
+    @property
+    def tension_margin(self) -> float:
+        """The smaller of the two least stresses (Pa): negative when tension is lost."""
+        return min(self.min_hoop_stress, self.min_meridional_stress)
+
+
+@dataclass
+class _Inputs:
+    """The broadcast inputs as flat arrays."""
+
+    shape: tuple[int, ...]
+    specimens: list[Specimen]
+    which: NDArray[np.intp]  # index of the specimen of each state
+    h: Array
+    voltage: Array
+
+    @classmethod
+    def gather(
+        cls, specimen: Specimen | Sequence[Specimen] | NDArray[np.object_], h: ArrayLike, v: ArrayLike
+    ) -> _Inputs:
+        h_array = np.asarray(h, dtype=float)
+        v_array = np.asarray(v, dtype=float)
+        if isinstance(specimen, Specimen):
+            specimens = [specimen]
+            index = np.zeros((), dtype=np.intp)
+        else:
+            grid = np.empty(len(specimen), dtype=object) if not isinstance(specimen, np.ndarray) else specimen
+            if not isinstance(specimen, np.ndarray):
+                grid[:] = list(specimen)
+            specimens = list(grid.ravel())
+            index = np.arange(len(specimens), dtype=np.intp).reshape(grid.shape)
+        which, hh, vv = np.broadcast_arrays(index, h_array, v_array)
+        return cls(hh.shape, specimens, which.ravel(), hh.ravel(), vv.ravel())
+
+
+def _padded(materials: Sequence[tuple[float, ...]], fill: float) -> Array:
+    terms = max(len(values) for values in materials)
+    return np.array([values + (fill,) * (terms - len(values)) for values in materials]).T
+
+
+def solve_many(
+    specimen: Specimen | Sequence[Specimen] | NDArray[np.object_],
+    h: ArrayLike,
+    voltage: ArrayLike = 0.0,
+    *,
+    tolerance: float = 1e-8,
+    wrinkling: Wrinkling = "plain",
+    sensitivities: bool = False,
+) -> Solutions:
+    """Solve many states at once.
+
+    Parameters
+    ----------
+    specimen : one film, or a sequence or object array of films, broadcast with the others
+    h, voltage : displacement of the disk (m) and voltage (V), broadcast to a shape S
+    tolerance : relative error of the force to aim for, 1e-12 to 1e-2
+    wrinkling : "plain", the paper's equations whatever the hoop stress; or "tension_field", the relaxed energy
+    sensitivities : also give ``dforce``
+
+    Returns
+    -------
+    Solutions of shape S. A state without an answer has a status that says so and NaN; it never raises.
+    """
+    if not 1e-12 <= tolerance <= 1e-2:
+        raise ValueError(f"tolerance = {tolerance!r}: allowed are 1e-12 to 1e-2")
+    if wrinkling not in ("plain", "tension_field"):
+        raise ValueError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
+    inputs = _Inputs.gather(specimen, h, voltage)
+    result = _Flat(len(inputs.h), max((len(s.material.mu) for s in inputs.specimens), default=1), sensitivities)
+    count = Evaluations()
+    with np.errstate(all="ignore"):
+        for start in range(0, len(inputs.h), BLOCK):
+            _Block(inputs, slice(start, start + BLOCK), count).solve(result, tolerance, sensitivities)
+    return result.solutions(inputs.shape, count)
+
+
+def solve(
+    specimen: Specimen,
+    h: float,
+    voltage: float = 0.0,
+    *,
+    tolerance: float = 1e-8,
+    wrinkling: Wrinkling = "plain",
+    sensitivities: bool = False,
+) -> Solution:
+    """Solve one state: `solve_many` for scalars, with the profiles at hand."""
+    many = solve_many(
+        specimen, float(h), float(voltage), tolerance=tolerance, wrinkling=wrinkling, sensitivities=sensitivities
+    )
+    return Solution(
+        specimen=specimen,
+        h=float(h),
+        voltage=float(voltage),
+        force=float(many.force),
+        peak_field=float(many.peak_field),
+        peak_field_radius=float(many.peak_field_radius),
+        min_hoop_stress=float(many.min_hoop_stress),
+        min_meridional_stress=float(many.min_meridional_stress),
+        max_stretch=float(many.max_stretch),
+        status=Status(int(many.status)),
+        error_estimate=float(many.error_estimate),
+        iterations=int(many.iterations),
+        modes=int(many.modes),
+        stable=bool(many.stable),
+        field_exceeded=bool(many.field_exceeded),
+        stretch_exceeded=bool(many.stretch_exceeded),
+        dforce=None
+        if many.dforce is None
+        else {k: v if k in ("mu", "alpha") else float(v) for k, v in many.dforce.items()},
+        evaluations=many.evaluations,
+    )
+
+
+class _Flat:
+    """The results while they are being filled, one entry a state."""
+
+    def __init__(self, states: int, terms: int, sensitivities: bool) -> None:
+        self.real = {
+            name: np.full(states, np.nan)
+            for name in (
+                "force",
+                "peak_field",
+                "peak_field_radius",
+                "min_hoop_stress",
+                "min_meridional_stress",
+                "max_stretch",
+                "error_estimate",
+            )
+        }
+        self.whole = {name: np.zeros(states, dtype=np.intp) for name in ("iterations", "modes")}
+        self.flag = {
+            name: np.zeros(states, dtype=np.bool_) for name in ("stable", "field_exceeded", "stretch_exceeded")
+        }
+        self.status = np.full(states, Status.INVALID, dtype=np.int8)
+        self.dforce: dict[str, Array] | None = None
+        if sensitivities:
+            names = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
+            self.dforce = {name: np.full(states, np.nan) for name in names}
+            self.dforce |= {name: np.full((states, terms), np.nan) for name in ("mu", "alpha")}
+
+    def solutions(self, shape: tuple[int, ...], count: Evaluations) -> Solutions:
+        dforce = None
+        if self.dforce is not None:
+            dforce = {name: values.reshape(shape + values.shape[1:]) for name, values in self.dforce.items()}
+        return Solutions(
+            **{name: values.reshape(shape) for name, values in (self.real | self.whole | self.flag).items()},
+            status=self.status.reshape(shape),
+            dforce=dforce,
+            evaluations=count,
+        )
+
+
+class _Block:
+    """Some of the states, in dimensionless form, and the way back to SI."""
+
+    def __init__(self, inputs: _Inputs, part: slice, count: Evaluations) -> None:
+        which, h, v = inputs.which[part], inputs.h[part], inputs.voltage[part]
+        valid = np.isfinite(h) & np.isfinite(v)
+        self.index = np.arange(part.start, part.start + len(h))[valid]
+        self.h, self.voltage = h[valid], v[valid]
+        used, pick = np.unique(which[valid], return_inverse=True)
+        films = [inputs.specimens[i] for i in used]
+        self.terms = np.array([len(s.material.mu) for s in films], dtype=np.intp)[pick]
+        numbers = np.array(
+            [
+                (
+                    s.disk_radius,
+                    s.ring_radius,
+                    s.thickness,
+                    s.prestretch,
+                    s.material.shear_modulus,
+                    s.material.eps_r,
+                    s.material.permittivity,
+                    s.material.breakdown_field or math.inf,
+                    s.material.max_stretch or math.inf,
+                )
+                for s in films
+            ]
+        ).reshape(len(films), 9)[pick]
+        self.a, self.b, self.t, self.lp, self.shear, self.eps_r, eps, self.strength, self.elongation = numbers.T
+        mu = _padded([s.material.mu for s in films], 0.0)
+        alpha = _padded([s.material.alpha for s in films], 1.0)
+        if len(films) > 1:
+            mu, alpha = mu[:, pick], alpha[:, pick]
+        charged = bool(np.any(self.voltage))
+        film = Film(
+            mu=mu / (self.shear if len(films) > 1 else self.shear[:1]),
+            alpha=alpha,
+            field=eps * (self.voltage / self.t) ** 2 / self.shear if charged else None,
+            count=count,
+        )
+        # The flat film is the limit of a vanishing height: solve there, then give zero force.
+        height = np.where(self.h == 0.0, 1e-9, np.abs(self.h) / self.b)
+        self.problem = Problem(film, np.log(self.lp), np.log(self.b / self.a), height)
+
+    def solve(self, result: _Flat, tolerance: float, sensitivities: bool) -> None:
+        if len(self.index) == 0:
+            return
+        rest = np.arange(len(self.index))
+        problem = self.problem
+        if problem.film.field is not None:
+            slack = self.slack()
+            result.status[self.index[slack]] = Status.SLACK
+            if slack.any():
+                rest = np.flatnonzero(~slack)
+                problem = problem.take(rest)
+        if len(rest) == 0:
+            return
+        answers, failed = climb(problem, tolerance, sensitivities=sensitivities)
+        for answer in answers:
+            self.place(result, rest[answer.index], answer)
+        result.status[self.index[rest[failed.index]]] = Status.NOT_CONVERGED
+        result.whole["iterations"][self.index[rest[failed.index]]] = failed.steps
+
+    def slack(self) -> NDArray[np.bool_]:
+        """Where the film, stretched like a straight cone, would push outwards: no tension can hold it."""
+        p = self.problem
+        cone = p.height / -np.expm1(-p.span)
+        log = (p.log_prestretch + 0.5 * np.log1p(cone * cone))[None]
+        tension: Array = stress(p.film, stack(log, log)).t1[0]
+        return tension < 0.0
+
+    def place(self, result: _Flat, where: NDArray[np.intp], answer: Answer) -> None:
+        """Write the answer for the block's states ``where``, in SI units."""
+        to = self.index[where]
+        h, v, t, shear, lp, b = (x[where] for x in (self.h, self.voltage, self.t, self.shear, self.lp, self.b))
+        sign = np.sign(h)
+        scale = 2.0 * np.pi * b * t * shear / lp**2
+        force = scale * answer.lam * sign
+        x = answer.extremes
+        result.real["force"][to] = force
+        result.real["peak_field"][to] = np.abs(v) / t * np.exp(x.log_area)
+        result.real["peak_field_radius"][to] = x.radius * b
+        result.real["min_hoop_stress"][to] = shear * x.hoop
+        result.real["min_meridional_stress"][to] = shear * x.meridional
+        result.real["max_stretch"][to] = np.exp(x.log_stretch)
+        result.real["error_estimate"][to] = answer.error
+        result.whole["iterations"][to] = answer.steps
+        result.whole["modes"][to] = answer.modes
+        result.flag["stable"][to] = True
+        result.flag["field_exceeded"][to] = result.real["peak_field"][to] > self.strength[where]
+        result.flag["stretch_exceeded"][to] = result.real["max_stretch"][to] > self.elongation[where]
+        # A hoop stress that is zero in the exact solution (flat, not pre-stretched) may come out as round-off.
+        result.status[to] = np.where(x.hoop >= -1e-13, Status.TAUT, Status.WRINKLED)
+        d = answer.derivatives
+        if d is None or result.dforce is None:
+            return
+        f = result.dforce
+        scale = scale * sign
+        slope = 2.0 * np.pi * t * shear / lp**2 * d.height
+        f["h"][to] = slope
+        f["prestretch"][to] = (scale * d.log_prestretch - 2.0 * force) / lp
+        f["eps_r"][to] = scale * d.log_field / self.eps_r[where]
+        f["voltage"][to] = np.where(v != 0.0, 2.0 * scale * d.log_field / np.where(v != 0.0, v, 1.0), 0.0)
+        f["thickness"][to] = (force - 2.0 * scale * d.log_field) / t
+        f["disk_radius"][to] = -scale * d.span / self.a[where]
+        f["ring_radius"][to] = (force - h * slope + scale * d.span) / b
+        absent = np.arange(d.mu.shape[0])[:, None] >= self.terms[where]
+        terms = d.mu.shape[0]
+        f["mu"][to, :terms] = np.where(absent, np.nan, scale / shear * d.mu).T
+        f["alpha"][to, :terms] = np.where(absent, np.nan, scale * d.alpha).T
