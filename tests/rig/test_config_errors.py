@@ -1,0 +1,154 @@
+"""Bad files give one message that names file, key, value and what is allowed, exit code 2 and no traceback."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rig.cli import main
+from rig.errors import ConfigError
+from rig.protocol import load_protocol
+from rig.scene import Scene, load_scene
+from rig.toml_file import MAX_BYTES
+
+FIXTURES = Path(str(files("sim_fixtures")))
+SCENE = FIXTURES / "scenes" / "cone-4mm.toml"
+PROTOCOL = FIXTURES / "protocols" / "paper.toml"
+
+
+def edited(tmp_path: Path, source: Path, old: str, new: str) -> Path:
+    text = source.read_text()
+    assert old in text
+    path = tmp_path / source.name
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("thickness_um = 40.0", "thickness_mm = 0.04", ["specimen, thickness_mm", "did you mean thickness_um"]),
+        ("force_N = 0.9", "force_N = nan", ["limits, force_N = nan", "finite"]),
+        ("force_N = 0.9", "force_N = inf", ["limits, force_N = inf", "finite"]),
+        ("force_N = 0.9", "force_N = -1.0", ["limits, force_N = -1.0", "greater than 0"]),
+        ("force_N = 0.9", 'force_N = "0.9"', ["limits, force_N = '0.9'", "number"]),
+        ("force_N = 0.9", "force_N = true", ["limits, force_N = True", "number"]),
+        ("force_N = 0.9\n", "", ["limits, force_N", "missing"]),
+        ('driver = "zaber"', 'driver = "zabre"', ["stage, driver = 'zabre'", "zaber"]),
+        ('driver = "zaber"', 'driver = "zaber"\nspeed = 1.0', ["stage, speed: unknown key", "approach_from_mm"]),
+        ("disk_radius_mm = 4.0", "disk_radius_mm = 24.0", ["disk_radius_mm must be smaller"]),
+        ("voltage_V = 1800.0\n", "", ["must give limits.voltage_V"]),
+        ("alpha = [2.0, 5.0]", "alpha = [2.0]", ["they must pair up"]),
+        ('name = "cone-4mm"', 'name = "../../etc"', ["specimen, name", "pattern"]),
+        ("[specimen]", "[specimen", ["not valid TOML", "line"]),
+    ],
+)
+def test_a_bad_scene_names_file_key_value_and_what_is_allowed(
+    tmp_path: Path, old: str, new: str, expected: list[str]
+) -> None:
+    path = edited(tmp_path, SCENE, old, new)
+    with pytest.raises(ConfigError) as caught:
+        load_scene(path)
+    message = str(caught.value)
+    assert str(path) in message
+    for words in expected:
+        assert words in message, message
+    assert len(message.splitlines()) < 20
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('do = "home"', 'do = "hoem"', ["step 1", "'hoem'", "'home'"]),
+        ("cycles = 2", "cycles = 0", ["step 4, cycles = 0", "greater than or equal to 1"]),
+        ("speed_mm_per_s = 1.0", "speed_m_per_s = 1.0", ["step 5, speed_m_per_s", "did you mean speed_mm_per_s"]),
+        ("[0, 1000, 1500]", "[0, nan, 1500]", ["step 5, voltages_V 2 = nan", "finite"]),
+        ("[0, 1000, 1500]", "[]", ["step 5, voltages_V = []", "at least 1"]),
+    ],
+)
+def test_a_bad_protocol_counts_its_steps_from_one(tmp_path: Path, old: str, new: str, expected: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(edited(tmp_path, PROTOCOL, old, new))
+    for words in expected:
+        assert words in str(caught.value), str(caught.value)
+
+
+def test_files_that_are_no_files(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    huge = tmp_path / "huge.toml"
+    huge.write_bytes(b"#" * (MAX_BYTES + 1))
+    nested = tmp_path / "nested.toml"
+    nested.write_text("a = " + "[" * 100_000)
+    long_number = tmp_path / "number.toml"
+    long_number.write_text("a = " + "1" * 10_000)
+    for path, words in [
+        (tmp_path / "missing.toml", "no such scene file"),
+        (tmp_path, "directory"),
+        (binary, "not UTF-8"),
+        (huge, "larger than"),
+        (nested, "not"),
+        (long_number, "not"),
+    ]:
+        with pytest.raises(ConfigError, match=words):
+            load_scene(path)
+
+
+def test_ports_are_named_for_all_instruments_or_for_none(tmp_path: Path) -> None:
+    path = edited(tmp_path, SCENE, 'driver = "zaber"', 'driver = "zaber"\nport = "/dev/ttyUSB0"')
+    with pytest.raises(ConfigError, match="name all or none"):
+        load_scene(path)
+
+
+def test_the_ports_of_a_served_bench_turn_the_scene_to_real_ports() -> None:
+    scene, _ = load_scene(SCENE)
+    assert not scene.on_real_ports
+    ports: dict[str, dict[str, object]] = {role: {"port": f"/dev/{role}"} for role in ("stage", "force", "displacement")}
+    ports["hv"] = {"interface": "slcan", "can_channel": "/dev/hv"}
+    moved = scene.with_ports(ports)
+    assert isinstance(moved, Scene) and moved.on_real_ports
+    assert moved.stage.port == "/dev/stage"
+    del ports["hv"]
+    with pytest.raises(ConfigError, match="no 'hv'"):
+        scene.with_ports(ports)
+
+
+@pytest.mark.parametrize("command", [["check"], ["run", "-o", "LOG"]])
+def test_the_command_line_ends_with_2_and_leaves_nothing(tmp_path: Path, command: list[str]) -> None:
+    scene = edited(tmp_path, SCENE, "thickness_um = 40.0", "thickness_um = nan")
+    before = sorted(tmp_path.iterdir())
+    arguments = [command[0], str(scene), str(PROTOCOL), *command[1:]]
+    arguments = [str(tmp_path / "x.mcap") if a == "LOG" else a for a in arguments]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert "thickness_um = nan" in result.output
+    assert "Traceback" not in result.output
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_protocol_beyond_a_limit_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
+    protocol = edited(tmp_path, PROTOCOL, "displacement_mm = 11.0\nspeed_mm_per_s = 1.0", "displacement_mm = 13.0\nspeed_mm_per_s = 1.0")
+    out = tmp_path / "x.mcap"
+    result = CliRunner().invoke(main, ["run", str(SCENE), str(protocol), "-o", str(out)])
+    assert result.exit_code == 3
+    assert "Step 5 (sweep" in result.output and "V/um is outside" in result.output
+    assert not out.exists() and not out.with_name("x.mcap.part").exists()
+
+
+def test_a_port_that_does_not_exist(tmp_path: Path) -> None:
+    text = SCENE.read_text()
+    for role in ("zaber", "gsv8", "keyence-lkg"):
+        text = text.replace(f'driver = "{role}"', f'driver = "{role}"\nport = "{tmp_path}/no-{role}"')
+    text = text.replace('driver = "iseg-edcp"', f'driver = "iseg-edcp"\ninterface = "slcan"\ncan_channel = "{tmp_path}/no-can"')
+    text = text.replace("../calibrations", str(FIXTURES / "calibrations"))
+    scene = tmp_path / "scene.toml"
+    scene.write_text(text)
+    out = tmp_path / "x.mcap"
+    result = CliRunner().invoke(main, ["run", str(scene), str(PROTOCOL), "-o", str(out), "--arm", "--yes"])
+    assert result.exit_code == 4, result.output
+    assert "no-zaber" in result.output and "stage" in result.output
+    assert "Traceback" not in result.output
+    assert not out.exists() and not out.with_name("x.mcap.part").exists()

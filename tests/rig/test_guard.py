@@ -1,0 +1,168 @@
+"""The guard's rules: starts safe, arms only a dead supply, checks the pair (displacement, voltage), latches on faults."""
+
+from __future__ import annotations
+
+import math
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from drivers.roles import HVFlag, HVSample
+from rig.errors import FaultError, LimitError
+from rig.safety.guard import Guard, GuardState, check_path
+from rig.safety.limits import FilmLimits, Limits
+from rig.scene import load_scene
+
+SCENE, _ = load_scene(Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml")
+OFF = HVFlag(0)
+
+
+class Supply:
+    """Writes down what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, float | None]] = []
+
+    def set_ramp(self, volts_per_second: float) -> None:
+        self.told.append(("set_ramp", volts_per_second))
+
+    def set_current_limit(self, amperes: float) -> None:
+        self.told.append(("set_current_limit", amperes))
+
+    def set_voltage(self, volts: float) -> None:
+        self.told.append(("set_voltage", volts))
+
+    def switch_on(self) -> None:
+        self.told.append(("switch_on", None))
+
+    def switch_off(self) -> None:
+        self.told.append(("switch_off", None))
+
+    def emergency_off(self) -> None:
+        self.told.append(("emergency_off", None))
+
+    @property
+    def words(self) -> list[str]:
+        return [word for word, _ in self.told]
+
+
+def make() -> tuple[Guard, Supply, list[str]]:
+    supply, log = Supply(), []
+    limits = Limits.of(SCENE)
+    film = FilmLimits(SCENE.specimen.specimen(), limits)
+    # Only the commands of the role are needed here.
+    guard = Guard(supply, limits, film, 300.0, lambda word, argument: log.append(word))  # type: ignore[arg-type]
+    return guard, supply, log
+
+
+def sample(voltage: float, flags: HVFlag = OFF, current: float = 0.0) -> HVSample:
+    return HVSample(0.0, voltage, current, 0.0, flags)
+
+
+def live() -> tuple[Guard, Supply, list[str]]:
+    guard, supply, log = make()
+    guard.on_sample(sample(0.0))
+    guard.on_sample(sample(0.0))
+    guard.arm()
+    guard.request(1000.0, 0.0)
+    return guard, supply, log
+
+
+def test_watching_changes_nothing() -> None:
+    guard, supply, log = make()
+    for voltage in (0.0, 1500.0, math.nan):
+        guard.on_sample(sample(voltage, HVFlag.ON | HVFlag.TRIPPED))
+    assert guard.state is GuardState.SAFE
+    guard.ramp_off("end")
+    guard.kill("end")
+    assert supply.told == [] and log == []
+
+
+@pytest.mark.parametrize(
+    ("samples", "words"),
+    [
+        ([], "not measured"),
+        ([sample(0.0)], "0 V"),
+        ([sample(0.0), sample(math.nan)], "nan"),
+        ([sample(0.0), sample(1500.0)], "1500 V"),
+        ([sample(0.0, HVFlag.ON)] * 2, "already on"),
+        ([sample(0.0, HVFlag.INTERLOCK_OPEN)] * 2, "interlock open"),
+    ],
+)
+def test_a_supply_that_is_not_measurably_off_is_not_armed_and_left_alone(samples: list[HVSample], words: str) -> None:
+    guard, supply, _ = make()
+    for one in samples:
+        guard.on_sample(one)
+    with pytest.raises(FaultError, match=words):
+        guard.arm()
+    assert supply.told == []
+    with pytest.raises(FaultError, match="latched"):
+        guard.request(100.0, 0.0)
+    assert supply.told == []
+
+
+def test_the_set_point_is_written_before_the_output_is_switched_on_and_logged_before_either() -> None:
+    _, supply, log = live()
+    assert supply.words == ["set_ramp", "set_current_limit", "set_voltage", "switch_on"]
+    assert log == ["arm", "set_voltage", "switch_on"]
+
+
+@pytest.mark.parametrize("volts", [-1.0, 1801.0, math.nan, math.inf])
+def test_a_voltage_outside_its_limit_is_refused(volts: float) -> None:
+    guard, supply, _ = live()
+    before = list(supply.told)
+    with pytest.raises(LimitError, match="voltage"):
+        guard.request(volts, 0.0)
+    assert supply.told == before
+
+
+def test_a_voltage_that_the_flat_film_bears_is_refused_on_the_stretched_one() -> None:
+    guard, supply, _ = live()
+    guard.request(1500.0, 0.0)
+    before = list(supply.told)
+    with pytest.raises(LimitError, match="field"):
+        guard.request(1500.0, 0.0125)
+    with pytest.raises(LimitError):
+        guard.request(1500.0, math.nan)
+    assert supply.told == before
+
+
+def test_a_path_is_checked_along_its_way() -> None:
+    limits = Limits.of(SCENE)
+    film = FilmLimits(SCENE.specimen.specimen(), limits)
+    check_path(film, 0.0, 0.011, 1500.0)
+    with pytest.raises(LimitError, match="field"):
+        check_path(film, 0.0, 0.0125, 1500.0)
+    with pytest.raises(LimitError, match="not a number"):
+        check_path(film, 0.0, math.nan, 0.0)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        sample(2000.0),
+        sample(math.nan),
+        sample(1000.0, current=60e-6),
+        sample(1000.0, current=math.nan),
+        sample(1000.0, HVFlag.ON | HVFlag.TRIPPED),
+        sample(1000.0, HVFlag.ARC),
+    ],
+)
+def test_a_bad_measurement_while_live_is_an_error_and_the_latch_holds(bad: HVSample) -> None:
+    guard, supply, _ = live()
+    with pytest.raises((LimitError, FaultError)):
+        guard.on_sample(bad)
+    guard.kill("test")
+    assert supply.words[-1] == "emergency_off"
+    with pytest.raises(FaultError, match="latched safe"):
+        guard.request(0.0, 0.0)
+    assert supply.words[-1] == "emergency_off"
+
+
+def test_off_is_believed_only_when_measured_twice() -> None:
+    guard, _, _ = live()
+    guard.ramp_off("end")
+    for voltage, safe in [(900.0, False), (30.0, False), (math.nan, False), (30.0, False), (10.0, True), (70.0, False)]:
+        guard.on_sample(sample(voltage))
+        assert guard.output_is_safe is safe
