@@ -57,6 +57,32 @@ class Answer(Generic[R]):
 Script = Generator[Ask[Q], Answer[R], None]
 
 
+class Schedule:
+    """Times ``period`` apart. Those that were missed are counted in ``counters["polls_missed"]``, not caught up.
+
+    ``due`` is the next time; infinity until `start`.
+    """
+
+    def __init__(self, period: float, counters: dict[str, int]) -> None:
+        self.due = math.inf
+        self._period = period
+        self._counters = counters
+        counters.setdefault("polls_missed", 0)
+
+    def start(self, now: float) -> None:
+        """Due at once, and from then on at the rate."""
+        self.due = now
+
+    def take(self, now: float) -> bool:
+        """True if a time has come; the next one is due then."""
+        if now < self.due:
+            return False
+        missed = int((now - self.due) / self._period)
+        self._counters["polls_missed"] += missed
+        self.due += (missed + 1) * self._period
+        return True
+
+
 @dataclass(slots=True)
 class _Outstanding(Generic[Q, R]):
     ask: Ask[Q]

@@ -26,7 +26,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
-from drivers.dialogue import Answer, Ask, Dialogue, Script
+from drivers.dialogue import Answer, Ask, Dialogue, Schedule, Script
 from drivers.link import ByteLink, DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import Identity, StageSample
 
@@ -326,11 +326,11 @@ class ZaberStage:
         self.name = name
         self.identity = Identity()
         self.settings: dict[str, str] = {}
-        self.counters: dict[str, int] = {"alerts": 0, "infos": 0, "unexpected_replies": 0, "polls_missed": 0}
+        self.counters: dict[str, int] = {"alerts": 0, "infos": 0, "unexpected_replies": 0}
         self._label = f"{name} ({link.name})"
         self._link = link
         self._device, self._axis = device, axis
-        self._period = 1.0 / poll_rate_Hz
+        self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
         self._full_step = full_step_um * 1e-6
         self._expected_serial = serial
         self._codec = Codec(self.counters)
@@ -349,7 +349,7 @@ class ZaberStage:
         self._message_id = -1
         self._inbox: deque[Message] = deque()
         self._samples: list[StageSample] = []
-        self._now = self._next_poll = self._due = 0.0
+        self._now = self._next_poll = 0.0
         self._ready = self._closed = False
         self._waiting_commands = 0
         self._accepted_at = -math.inf
@@ -426,16 +426,12 @@ class ZaberStage:
             self._inbox.extend(self._codec.feed(self._link.read()))
             while self._inbox:
                 self._take(self._inbox.popleft(), now)
-            if self._ready and self._dialogue.idle and now >= self._due:
-                self._due += self._period
-                if self._due <= now:
-                    self.counters["polls_missed"] += int((now - self._due) / self._period)
-                    self._due = now + self._period
+            if self._ready and self._dialogue.idle and self._schedule.take(now):
                 self._dialogue.begin(self._watch())
             self._urgent.run(now)
             self._dialogue.run(now)
         finally:
-            due = max(self._due, now) if self._ready and self._dialogue.idle else math.inf
+            due = self._schedule.due if self._dialogue.idle else math.inf
             next_poll = min(self._urgent.next_poll(now), self._dialogue.next_poll(now), due)
             self._next_poll = now if self._inbox else next_poll
         samples, self._samples = self._samples, []
@@ -464,7 +460,7 @@ class ZaberStage:
     def _take(self, message: Message, now: float) -> None:
         if isinstance(message, Alert):
             self.counters["alerts"] += 1
-            self._due = min(self._due, now)  # something has changed: look at once
+            self._schedule.start(now)  # something has changed: look at once
         elif isinstance(message, Info):
             self.counters["infos"] += 1
         elif not (self._urgent.offer(message, now) or self._dialogue.offer(message, now)):
@@ -521,7 +517,7 @@ class ZaberStage:
             "knob": "locked" if knob.accepted else f"not locked: {knob.data}",
             "reply_checksums": "yes" if self._codec.checksums_seen else "no",
         }
-        self._due = self._now
+        self._schedule.start(self._now)
         self._ready = True
 
     def _watch(self) -> Script[_Command, Reply]:
@@ -590,7 +586,6 @@ class ZaberStage:
         """From here on only the reply to a later question can say that the stage stands still."""
         self._busy = True
         self._accepted_at = answer.received
-        self._due = answer.received
 
     def _ask(
         self, words: str, *, axis: int | None = None, repeat: bool = True, may_fail: bool = False
