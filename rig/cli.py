@@ -55,7 +55,7 @@ def main() -> None:
 
 
 @main.command()
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Directory to make; default dea-rig-demo.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Directory to make.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the simulation.")
 def demo(out: Path | None, seed: int) -> None:
     """Characterise two simulated specimens, start to finish, and compare with the truth."""

@@ -40,7 +40,9 @@ def run_demo(out: Path | None, seed: int) -> None:
         _set_seed(scene_path, seed + number)
         experiment = prepare(scene_path, folder / "protocols" / f"{PROTOCOL}.toml")
         log = folder / f"{name}.mcap"
-        with progress(f"{name}: {experiment.protocol.title}, {experiment.duration:.0f} s of the bench's time") as update:
+        with progress(
+            f"{name}: {experiment.protocol.title}, {experiment.duration:.0f} s of the bench's time"
+        ) as update:
             outcome = run_experiment(experiment, log, update)
         click.echo(f"{log}: {outcome.reason}; {outcome.state}.")
         logs.append(log)

@@ -65,9 +65,7 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
     protocol, protocol_text = load_protocol(protocol_path)
     certificates = _certificates(scene, scene_path.parent)
     actions = plan(protocol, scene)
-    return Experiment(
-        scene, scene_text, protocol, protocol_text, certificates, actions, check_plan(actions, scene)
-    )
+    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, check_plan(actions, scene))
 
 
 def run(experiment: Experiment, out: Path, progress: Callable[[float, float, str], None]) -> Outcome:
@@ -161,5 +159,3 @@ def _attach(log: LogWriter, experiment: Experiment, problems: list[str]) -> None
             "started": calendar_now().isoformat(timespec="seconds"),
         },
     )
-
-

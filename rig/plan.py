@@ -180,9 +180,7 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
             target = -step.clearance_mm * 1e-3 if contact else 0.0
             speed = step.speed_mm_per_s * 1e-3
             if contact:
-                yield Action(
-                    number, kind, "back from the film", (h, target), (0, 0), abs(target - h) / speed, speed
-                )
+                yield Action(number, kind, "back from the film", (h, target), (0, 0), abs(target - h) / speed, speed)
             h, contact = 0.0, False
 
 

@@ -141,9 +141,7 @@ class Recorder:
 
     def target(self, displacement: float, voltage: float, speed: float) -> None:
         """Write where the rig is being sent."""
-        self._write(
-            "/target", self._clock.now(), displacement_m=displacement, voltage_V=voltage, speed_m_per_s=speed
-        )
+        self._write("/target", self._clock.now(), displacement_m=displacement, voltage_V=voltage, speed_m_per_s=speed)
 
     def tick(self, now: float) -> None:
         """Let the log send what is due to its file."""

@@ -83,7 +83,9 @@ class Guard:
                 "Find out who switched it on; ramp it down by hand; start again."
             )
         if HVFlag.ON in self.last.flags:
-            raise FaultError("hv: cannot be armed, the channel is already on. Nothing was changed. Switch it off first.")
+            raise FaultError(
+                "hv: cannot be armed, the channel is already on. Nothing was changed. Switch it off first."
+            )
         faults = self.last.flags & TRIP
         if faults:
             raise FaultError(f"hv: cannot be armed, the supply reports {flag_names(faults)}. Clear the cause first.")

@@ -106,7 +106,9 @@ def test_ports_are_named_for_all_instruments_or_for_none(tmp_path: Path) -> None
 def test_the_ports_of_a_served_bench_turn_the_scene_to_real_ports() -> None:
     scene, _ = load_scene(SCENE)
     assert not scene.on_real_ports
-    ports: dict[str, dict[str, object]] = {role: {"port": f"/dev/{role}"} for role in ("stage", "force", "displacement")}
+    ports: dict[str, dict[str, object]] = {
+        role: {"port": f"/dev/{role}"} for role in ("stage", "force", "displacement")
+    }
     ports["hv"] = {"interface": "slcan", "can_channel": "/dev/hv"}
     moved = scene.with_ports(ports)
     assert isinstance(moved, Scene) and moved.on_real_ports
@@ -130,7 +132,12 @@ def test_the_command_line_ends_with_2_and_leaves_nothing(tmp_path: Path, command
 
 
 def test_a_protocol_beyond_a_limit_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
-    protocol = edited(tmp_path, PROTOCOL, "displacement_mm = 11.0\nspeed_mm_per_s = 1.0", "displacement_mm = 13.0\nspeed_mm_per_s = 1.0")
+    protocol = edited(
+        tmp_path,
+        PROTOCOL,
+        "displacement_mm = 11.0\nspeed_mm_per_s = 1.0",
+        "displacement_mm = 13.0\nspeed_mm_per_s = 1.0",
+    )
     out = tmp_path / "x.mcap"
     result = CliRunner().invoke(main, ["run", str(SCENE), str(protocol), "-o", str(out)])
     assert result.exit_code == 3
@@ -142,7 +149,9 @@ def test_a_port_that_does_not_exist(tmp_path: Path) -> None:
     text = SCENE.read_text()
     for role in ("zaber", "gsv8", "keyence-lkg"):
         text = text.replace(f'driver = "{role}"', f'driver = "{role}"\nport = "{tmp_path}/no-{role}"')
-    text = text.replace('driver = "iseg-edcp"', f'driver = "iseg-edcp"\ninterface = "slcan"\ncan_channel = "{tmp_path}/no-can"')
+    text = text.replace(
+        'driver = "iseg-edcp"', f'driver = "iseg-edcp"\ninterface = "slcan"\ncan_channel = "{tmp_path}/no-can"'
+    )
     text = text.replace("../calibrations", str(FIXTURES / "calibrations"))
     scene = tmp_path / "scene.toml"
     scene.write_text(text)

@@ -13,8 +13,10 @@ def imported_by(code: str) -> set[str]:
     """Which of HEAVY a fresh interpreter has loaded after running ``code``."""
     show = f"import sys\n{code}\nprint(','.join(m for m in {HEAVY!r} if m in sys.modules))"
     root = Path(__file__).resolve().parents[2]
-    done = subprocess.run([sys.executable, "-c", show], capture_output=True, text=True, check=True, cwd=root, timeout=60)
-    return set(done.stdout.strip().splitlines()[-1].split(",")) - {""}
+    done = subprocess.run(
+        [sys.executable, "-c", show], capture_output=True, text=True, check=True, cwd=root, timeout=60
+    )
+    return set(done.stdout.splitlines()[-1].split(",")) - {""}
 
 
 def test_help_imports_nothing_heavy() -> None:
