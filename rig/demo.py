@@ -1,4 +1,4 @@
-"""The main job on the simulated bench: two specimens through the real drivers, identified and held against the truth."""
+"""The main job on the simulated bench: two specimens through the real drivers, identified, held against truth."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def run_demo(out: Path | None, seed: int) -> None:
     click.echo(f"Left in {folder}/: two logs, {fit.name}, {report.name}, and the files they came from. Try next:")
     click.echo(f"  dea-rig view {logs[0]}")
     click.echo(f"  dea-rig check {folder}/scenes/{SCENES[0]}.toml {folder}/protocols/{PROTOCOL}.toml")
-    click.echo(f"  change a number there, then: dea-rig run SCENE PROTOCOL -o my.mcap && dea-rig fit my.mcap")
+    click.echo("  change a number there, then: dea-rig run SCENE PROTOCOL -o my.mcap && dea-rig fit my.mcap")
 
 
 def _make_folder(out: Path | None) -> Path:

@@ -92,7 +92,7 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
 
     for number, step in enumerate(protocol.step, start=1):
         kind = step.do
-        wanted = max(getattr(step, "voltages_V", [0.0]) + [getattr(step, "voltage_V", 0.0)])
+        wanted = max([*getattr(step, "voltages_V", []), getattr(step, "voltage_V", 0.0)])
         if wanted > 0 and scene.hv is None:
             raise LimitError(f"Step {number} ({kind}) asks for {wanted:g} V, but the scene has no [hv] instrument.")
         if kind in ("precondition", "ramp", "sweep", "voltage") and not contact:

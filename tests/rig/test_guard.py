@@ -1,4 +1,4 @@
-"""The guard's rules: starts safe, arms only a dead supply, checks the pair (displacement, voltage), latches on faults."""
+"""The guard starts safe, arms only a dead supply, checks the pair (displacement, voltage), and latches on faults."""
 
 from __future__ import annotations
 

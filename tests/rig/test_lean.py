@@ -20,7 +20,10 @@ def imported_by(code: str) -> set[str]:
 
 
 def test_help_imports_nothing_heavy() -> None:
-    code = "from click.testing import CliRunner\nfrom rig.cli import main\nassert CliRunner().invoke(main, ['--help']).exit_code == 0"
+    code = (
+        "from click.testing import CliRunner\nfrom rig.cli import main\n"
+        "assert CliRunner().invoke(main, ['--help']).exit_code == 0"
+    )
     assert imported_by(code) == set()
 
 
