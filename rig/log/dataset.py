@@ -1,0 +1,277 @@
+"""One run as aligned arrays: what happened, on the time base of the force samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, Required, TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.log.errors import LogError
+from rig.log.reader import Columns, Log, read_log
+
+if TYPE_CHECKING:
+    from calibration.curve import Curve
+    from model.specimen import Specimen
+
+Floats = NDArray[np.float64]
+
+# Values are interpolated between neighbouring samples only; a hole longer than this many sample periods stays one.
+LONGEST_PERIODS = 3.0
+
+_TOPICS = ("/force/sample", "/displacement/sample", "/stage/sample", "/hv/sample")
+
+
+class Phase(NamedTuple):
+    """What began at ``t`` (s): a part of protocol step ``step``."""
+
+    t: float
+    step: int
+    kind: str
+    label: str
+    cycle: int
+    direction: int
+    voltage: float
+    record: bool
+
+
+class Reference(NamedTuple):
+    """A zero or a position taken at ``t`` (s), with its standard uncertainty in the same ``unit``."""
+
+    t: float
+    name: str
+    value: float
+    standard_uncertainty: float
+    unit: str
+
+
+class CurveErrors(TypedDict, total=False):
+    """The uncertainties of `calibration.curve.Curve`, which explains them."""
+
+    force_noise: Required[float]
+    displacement_noise: float
+    force_gain: float
+    force_zero: float
+    displacement_zero: float
+    displacement_gain: float
+    voltage_gain: float
+    thickness_uncertainty: float
+    prestretch_uncertainty: float
+    disk_radius_uncertainty: float
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One log, aligned. Arrays have one row per force sample; NaN marks what is not known at that instant.
+
+    Attributes
+    ----------
+    log : rig.log.reader.Log
+        Where it is from, with gaps, metadata and outcome.
+    t : ndarray
+        Time of the force sample, seconds since the start of the run, rising.
+    force : ndarray
+        Force on the film (N). NaN before the force zero was taken.
+    h : ndarray
+        Out-of-plane displacement of the film (m): by the laser where the log has one, else the stage's position
+        minus the contact position. NaN before the reference was taken and inside gaps.
+    voltage : ndarray
+        Measured voltage (V); zeros when the scene has no HV supply.
+    flagged : ndarray of bool
+        Force samples that the instrument itself called bad.
+    phase : ndarray of int
+        Index into ``phases`` of what was going on; -1 before the first.
+    phases, references : list
+        In the order of time.
+    """
+
+    log: Log
+    t: Floats
+    force: Floats
+    h: Floats
+    voltage: Floats
+    flagged: NDArray[np.bool_]
+    phase: NDArray[np.intp]
+    phases: list[Phase]
+    references: list[Reference]
+    force_per_reading: float  # N per mV/V, as applied during the run; NaN when no force was recorded
+
+    @property
+    def has_laser(self) -> bool:
+        """Whether displacement was measured by a sensor of its own."""
+        return "/displacement/sample" in self.log.topics
+
+    @property
+    def has_hv(self) -> bool:
+        """Whether there was an HV supply."""
+        return "/hv/sample" in self.log.topics
+
+    @property
+    def scene(self) -> str:
+        """The text of the scene file."""
+        return self._text("scene.toml")
+
+    @property
+    def protocol(self) -> str:
+        """The text of the protocol file."""
+        return self._text("protocol.toml")
+
+    def reference(self, name: str, t: float = np.inf) -> Reference | None:
+        """The newest reference of that name taken before ``t``."""
+        found = [reference for reference in self.references if reference.name == name and reference.t <= t]
+        return found[-1] if found else None
+
+    def curves(self, specimen: Specimen, **errors: Unpack[CurveErrors]) -> list[Curve]:
+        """The recorded parts as curves ready for identification: one per step, voltage and cycle.
+
+        Parameters
+        ----------
+        specimen : model.specimen.Specimen
+            As the scene describes it.
+        **errors : float
+            Uncertainties for every curve. Those of the force zero and of the displacement zero come from the log's
+            references unless they are given.
+        """
+        from calibration.curve import Curve
+
+        parts: dict[tuple[int, float, int], list[int]] = {}
+        for index, phase in enumerate(self.phases):
+            if phase.record:
+                parts.setdefault((phase.step, phase.voltage, phase.cycle), []).append(index)
+        curves = []
+        for (step, voltage, cycle), indexes in parts.items():
+            rows = np.flatnonzero(np.isin(self.phase, indexes))
+            if rows.size:
+                label = f"{specimen.name or self.log.path.stem}, {voltage:g} V, step {step}, cycle {cycle + 1}"
+                direction = np.array([phase.direction for phase in self.phases], dtype=np.int8)[self.phase[rows]]
+                curves.append(
+                    Curve(
+                        label=label,
+                        run=self.log.path.name,
+                        specimen=specimen,
+                        h=self.h[rows],
+                        force=self.force[rows],
+                        voltage=self.voltage[rows],
+                        nominal_voltage=voltage,
+                        direction=direction,
+                        flagged=self.flagged[rows],
+                        **{**self._zero_errors(float(self.t[rows[0]])), **errors},  # type: ignore[arg-type] # keys as above
+                    )
+                )
+        return curves
+
+    def _zero_errors(self, t: float) -> dict[str, float]:
+        found: dict[str, float] = {}
+        force_zero = self.reference("force_zero", t)
+        if force_zero is not None:
+            found["force_zero"] = abs(self.force_per_reading) * force_zero.standard_uncertainty
+        zero = self.reference("displacement_zero" if self.has_laser else "contact_position", t)
+        if zero is not None:
+            found["displacement_zero"] = zero.standard_uncertainty
+        return found
+
+    def _text(self, name: str) -> str:
+        attachment = self.log.attachments.get(name)
+        if attachment is None:
+            raise LogError(self.log.path, f"has no {name} inside that can be read", "Give the file itself.")
+        return attachment.data.decode(errors="replace")
+
+
+def load_run(path: Path, latency: Mapping[str, float] | None = None) -> Run:
+    """The run in the log at ``path``.
+
+    Parameters
+    ----------
+    latency : mapping of str to float, optional
+        Seconds by which the time stamps of a role ("force", "displacement", "stage", "hv") come late, as measured;
+        they are taken off.
+
+    Raises
+    ------
+    rig.log.errors.LogError
+        The log cannot be read, or holds no force samples.
+    """
+    log = read_log(path)
+    if "/force/sample" not in log.topics:
+        raise LogError(path, "holds no force samples", "There is nothing to align.")
+    tables = log.tables(_TOPICS)
+    late = dict(latency or {})
+    times = {topic: tables[topic]["t_s"] - late.pop(topic.split("/")[1], 0.0) for topic in _TOPICS}
+    if late:
+        raise ValueError(f"latency of {', '.join(late)}; roles are force, displacement, stage, hv")
+    phases = sorted((Phase(*message.fields.values()) for message in log.messages("/phase")), key=_time)
+    references = sorted((Reference(*message.fields.values()) for message in log.messages("/reference")), key=_time)
+
+    force = tables["/force/sample"]
+    order = np.argsort(times["/force/sample"], kind="stable")
+    t = times["/force/sample"][order]
+    newton, reading = force["force_N"][order], force["reading_mV_per_V"][order]
+    h_topic = "/displacement/sample" if "/displacement/sample" in log.topics else "/stage/sample"
+    if "/hv/sample" in log.topics:
+        voltage = interpolate(t, times["/hv/sample"], tables["/hv/sample"]["voltage_V"])
+    else:
+        voltage = np.zeros_like(t)
+    return Run(
+        log=log,
+        t=t,
+        force=newton,
+        h=interpolate(t, times[h_topic], _displacement(h_topic, tables[h_topic], references)),
+        voltage=voltage,
+        flagged=force["flags"][order] != 0,
+        phase=np.searchsorted([phase.t for phase in phases], t, side="right") - 1,
+        phases=phases,
+        references=references,
+        force_per_reading=_gain(newton, reading - _newest(t, references, "force_zero")),
+    )
+
+
+def interpolate(t: Floats, sample_t: Floats, values: Floats) -> Floats:
+    """``values`` at times ``t``, linear between neighbouring samples.
+
+    A sample exactly at ``t`` stands for itself. NaN outside the samples, beside a sample that is NaN, and where the
+    neighbours are more than `LONGEST_PERIODS` sample periods (their median) apart.
+    """
+    order = np.argsort(sample_t, kind="stable")
+    sample_t, values = sample_t[order], values[order]
+    result = np.full(t.shape, np.nan)
+    if sample_t.size < 2:
+        return result
+    longest = LONGEST_PERIODS * float(np.median(np.diff(sample_t)))
+    left = np.clip(np.searchsorted(sample_t, t, side="right") - 1, 0, sample_t.size - 2)
+    gap = sample_t[left + 1] - sample_t[left]
+    weight = np.divide(t - sample_t[left], gap, out=np.full_like(t, np.nan), where=gap > 0)
+    between = (weight > 0.0) & (weight < 1.0) & (gap <= longest)
+    result[between] = ((1.0 - weight) * values[left] + weight * values[left + 1])[between]
+    for row, side in ((weight == 0.0, left), (weight == 1.0, left + 1)):
+        result[row] = values[side[row]]
+    return result
+
+
+def _displacement(topic: str, table: Columns, references: list[Reference]) -> Floats:
+    if topic == "/displacement/sample":
+        return np.where(table["flags"] == 0, table["displacement_m"], np.nan)
+    contact = _newest(table["t_s"], references, "contact_position")
+    return np.asarray(table["position_m"] - contact, dtype=np.float64)
+
+
+def _newest(t: Floats, references: list[Reference], name: str) -> Floats:
+    """The value of the newest reference of that name at each time; NaN before the first."""
+    found = [reference for reference in references if reference.name == name]
+    values = np.array([np.nan, *(reference.value for reference in found)])
+    return values[np.searchsorted([reference.t for reference in found], t, side="right")]
+
+
+def _gain(force: Floats, net_reading: Floats) -> float:
+    """Newtons per mV/V as applied: the ratio at the sample with the largest net reading."""
+    usable = np.flatnonzero(np.isfinite(force) & np.isfinite(net_reading) & (net_reading != 0))
+    if not usable.size:
+        return float("nan")
+    largest = usable[np.argmax(np.abs(net_reading[usable]))]
+    return float(force[largest] / net_reading[largest])
+
+
+def _time(row: Phase | Reference) -> float:
+    return row.t
