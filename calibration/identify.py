@@ -1,0 +1,449 @@
+"""Ogden parameters and permittivity of a film from its force-displacement curves, with uncertainties to be believed.
+
+All curves, voltages and specimens are fitted at once. The film's parameters enter as stiffness shares
+``g_n = mu_n alpha_n / (2 G_0) > 0`` and exponents ``alpha_n``, all of order one, with ``eps_r`` where there is
+voltage. The zeros of force and displacement of each run are nuisance parameters whose prior is their stated
+uncertainty. Gains and the specimen's dimensions are not fitted, because the data must not be allowed to excuse a wrong
+model with a wrong gain: their uncertainties are propagated linearly (JCGM 100:2008, 5.1) and stated apart.
+
+Convention of the Ogden terms: `model.materials.Material`.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import warnings as python_warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincc
+
+from calibration.curve import Curve
+from calibration.problem import TOLERANCE, IdentificationError, Problem
+from calibration.propagation import secant_modulus, state
+from calibration.reduction import interpolation_matrix, select
+from calibration.result import CurveResult, Identification, Quantity
+from model.materials import Material
+from model.membrane import solve_many
+
+Array = NDArray[np.float64]
+
+__all__ = ["IdentificationError", "compare", "expected_uncertainties", "identify", "secant_modulus"]
+
+PASSES = 5
+SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
+SHARE_BOUNDS = (1e-6, 100.0)
+EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
+PERMITTIVITY_BOUNDS = (0.5, 200.0)
+AT_BOUND = 1e-4  # distance to a bound, relative to the distance of the bounds
+SAME_MINIMUM = 0.5  # chi-square by which two minima may differ and count as one
+
+
+def identify(
+    curves: Sequence[Curve],
+    *,
+    terms: int = 2,
+    starts: int = 6,
+    seed: int = 0,
+    fixed: Mapping[str, float] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> Identification:
+    """Fit an Ogden film to force-displacement curves.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+        All curves of all runs and specimens of one film material.
+    terms : int
+        Number of Ogden terms.
+    starts : int
+        Starting points; the first is the material of the specimens, the others are drawn with ``seed``.
+    fixed : mapping of str to float, optional
+        ``alpha1``... and ``eps_r`` that are known and not to be fitted, e.g. ``{"eps_r": 1.7}``.
+    provenance : mapping, optional
+        Whatever identifies the data (hashes of logs, names of files), as plain JSON values; kept in the result.
+
+    Raises
+    ------
+    IdentificationError
+        When nothing can be identified from these curves.
+    """
+    held = dict(fixed or {})
+    allowed = [*(f"alpha{n + 1}" for n in range(terms)), "eps_r"]
+    unknown = [name for name in held if name not in allowed]
+    if unknown:
+        raise IdentificationError(f"cannot fix {', '.join(unknown)}; what can be fixed is {', '.join(allowed)}")
+    if terms < 1 or starts < 1:
+        raise IdentificationError("terms and starts must be at least 1")
+    if not curves:
+        raise IdentificationError("there are no curves")
+
+    guess = curves[0].specimen.material
+    if "eps_r" in held:
+        guess = replace(guess, eps_r=held["eps_r"])
+    material = _scaled(guess, curves)
+    selections = select(curves, material)
+    notes: list[str] = []
+    fits: list[_Fit] = []
+    for number in range(PASSES):
+        problem = Problem(curves, selections, terms, material)
+        if not fits:
+            guesses = _starting_materials(material, terms, starts, seed, held)
+            points = [problem.vector(_scaled(start, curves)) for start in guesses]
+            fits = sorted(
+                (fit for fit in (_minimise(problem, x, held) for x in points) if fit is not None),
+                key=lambda fit: fit.cost,
+            )
+            if not fits:
+                raise IdentificationError("no fit converged from any starting point; is the specimen's geometry right?")
+            best = fits[0]
+        else:
+            again = _minimise(problem, best.restarted(problem), held)
+            best = best if again is None else again
+        material = problem.film(best.x)
+        previous, selections = selections, select(curves, material)
+        # The first pass took its weights and its corrections for voltage from the guess: always make a second one.
+        if number > 0 and all(np.array_equal(a.used, b.used) for a, b in zip(previous, selections, strict=True)):
+            break
+    else:
+        notes.append("the set of samples at which the film is taut did not settle while fitting")
+    notes += _other_minima(fits)
+    agreeing = sum(fit.cost - fits[0].cost < SAME_MINIMUM for fit in fits)
+    record = {
+        "data": dict(provenance or {}),
+        "settings": {"terms": terms, "starts": starts, "seed": seed, "fixed": held},
+        "software": {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")},
+    }
+    return _assemble(best, held, (len(fits), agreeing), notes, record)
+
+
+def compare(curves: Sequence[Curve], *, terms: Sequence[int] = (1, 2, 3), **options: Any) -> list[Identification]:
+    """`identify` with each number of Ogden terms, to be compared by ``aicc`` and ``bic``; ``options`` as there."""
+    return [identify(curves, terms=count, **options) for count in terms]
+
+
+def expected_uncertainties(curves: Sequence[Curve], material: Material) -> dict[str, Quantity]:
+    """What `identify` would state if ``material`` were the truth and the curves' noise were as they say.
+
+    Only the displacements, voltages and uncertainties of ``curves`` matter, not their forces: this is for planning.
+    """
+    problem = Problem(curves, select(curves, material), len(material.mu), material, trust_noise=True)
+    x = problem.vector(material)
+    return state(problem, x, np.zeros(x.size, dtype=np.bool_), held={}).quantities
+
+
+# --- starting points and minimisation
+
+
+def _scaled(material: Material, curves: Sequence[Curve]) -> Material:
+    """``material`` made as stiff as the curves with the least voltage say it is."""
+    least = min(abs(curve.nominal_voltage) for curve in curves)
+    measured_by_model = model_squared = 0.0
+    for curve in curves:
+        rows = curve.usable & (curve.h > 0.0)
+        if abs(curve.nominal_voltage) > least or not rows.any():
+            continue
+        grid = np.linspace(0.0, float(curve.h[rows].max()), 9)
+        force = solve_many(curve.specimen.with_material(material), grid).force
+        known = np.isfinite(force)
+        model = np.interp(curve.h[rows], grid[known], force[known])
+        measured_by_model += float(curve.force[rows] @ model)
+        model_squared += float(model @ model)
+    if not measured_by_model > 0.0:
+        raise IdentificationError(
+            "the force does not rise with the displacement in the curves with the least voltage: "
+            "is the sign of the force or of the displacement right, and is there a film?"
+        )
+    ratio = measured_by_model / model_squared
+    return replace(material, mu=tuple(mu * ratio for mu in material.mu))
+
+
+def _starting_materials(
+    guess: Material, terms: int, count: int, seed: int, held: Mapping[str, float]
+) -> list[Material]:
+    """The guess, where it has as many terms, and random sets with the same modulus; every third with alpha_1 < 0."""
+    random = np.random.default_rng(seed)
+    sets: list[tuple[Array, Array]] = []
+    mu, alpha = np.array(guess.mu), np.array(guess.alpha)
+    if len(mu) == terms and (mu * alpha > 0.0).all():
+        sets.append((mu * alpha / 2.0, alpha))
+    while len(sets) < count:
+        alpha = np.sort(np.exp(random.uniform(math.log(1.2), math.log(12.0), terms)))
+        if terms > 1 and len(sets) % 3 == 2:
+            alpha[0] *= -1.0
+        sets.append((guess.shear_modulus * random.dirichlet(np.ones(terms)), alpha))
+    materials = []
+    for share, alpha in sets[:count]:
+        alpha = np.array([held.get(f"alpha{n + 1}", value) for n, value in enumerate(alpha)])
+        mu = 2.0 * share / alpha
+        materials.append(Material(name="start", mu=tuple(mu), alpha=tuple(alpha), eps_r=guess.eps_r))
+    return materials
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A minimum: parameter vector, chi-square of the reduced data, which film parameters may vary or sit at a bound."""
+
+    problem: Problem
+    x: Array
+    cost: float
+    converged: bool
+    evaluations: int
+    varied: NDArray[np.bool_]
+    at_bound: NDArray[np.bool_]
+    covariance: Array | None  # lmfit's own, of the varied parameters
+
+    def restarted(self, problem: Problem) -> Array:
+        """This minimum as a starting point of ``problem``, whose scale and set of zeros may differ."""
+        x = problem.vector(self.problem.film(self.x))
+        zeros = {zero[:2]: value for zero, value in zip(self.problem.zeros, self.x[self._zeros :], strict=True)}
+        x[problem.film_parameters :] = [zeros.get(zero[:2], 0.0) for zero in problem.zeros]
+        return x
+
+    @property
+    def _zeros(self) -> int:
+        return self.problem.film_parameters
+
+
+def _minimise(problem: Problem, start: Array, held: Mapping[str, float]) -> _Fit | None:
+    """Least squares from one starting point; None where the model has no answer there."""
+    import lmfit
+
+    n = problem.terms
+    lower = np.full(start.size, -np.inf)
+    upper = np.full(start.size, np.inf)
+    lower[:n], upper[:n] = SHARE_BOUNDS
+    negative = start[n : 2 * n] < 0.0
+    lower[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[1], EXPONENT_BOUNDS[0])
+    upper[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[0], EXPONENT_BOUNDS[1])
+    if problem.electric:
+        lower[2 * n], upper[2 * n] = PERMITTIVITY_BOUNDS
+    varied = np.array([name not in held for name in problem.names])
+    margin = np.where(np.isfinite(upper - lower), 1e-3 * (upper - lower), 0.0)
+    start = np.where(varied, np.clip(start, lower + np.minimum(margin, 1e-3), upper - margin), start)
+    if not problem.answers(start):
+        return None
+
+    parameters = lmfit.Parameters()
+    for name, value, low, high, vary in zip(problem.names, start, lower, upper, varied, strict=True):
+        parameters.add(name, value=float(value), min=low, max=high, vary=bool(vary))
+
+    def vector(values: Any) -> Array:
+        return np.array([values[name].value for name in problem.names])
+
+    def residual(values: Any) -> Array:
+        return problem.residual(vector(values))
+
+    def jacobian(values: Any) -> Array:
+        return problem.jacobian(vector(values))[:, varied]
+
+    # scale_covar off: the weights come from calibration, and a misfit must show as one.
+    minimiser = lmfit.Minimizer(residual, parameters, scale_covar=False, nan_policy="raise")
+    with python_warnings.catch_warnings(), np.errstate(all="ignore"):
+        # lmfit takes square roots of its own covariance, which is not positive definite for terms that are not
+        # identifiable. Ours (`_Covariance`) is used instead.
+        python_warnings.simplefilter("ignore")
+        out = minimiser.minimize(
+            method="least_squares", jac=jacobian, x_scale="jac", ftol=1e-10, xtol=1e-9, gtol=1e-9, max_nfev=200
+        )
+    x = vector(out.params)
+    if not problem.answers(x):
+        return None
+    final = problem.residual(x)
+    span = np.where(np.isfinite(upper - lower), upper - lower, np.inf)
+    at_bound = varied & (np.minimum(x - lower, upper - x) < AT_BOUND * span) & np.isfinite(span)
+    if not any(name.startswith("alpha") for name in held):
+        order = np.argsort(x[n : 2 * n])
+        order = np.concatenate((order, n + order, np.arange(2 * n, x.size)))
+        x, at_bound = x[order], at_bound[order]
+    return _Fit(
+        problem,
+        x,
+        float(final @ final),
+        bool(out.success),
+        int(out.nfev),
+        varied,
+        at_bound,
+        getattr(out, "covar", None),
+    )
+
+
+def _other_minima(fits: Sequence[_Fit]) -> list[str]:
+    """Words for sets of parameters that differ from the best one by more than 20 % and fit as well."""
+    best = fits[0]
+    for fit in fits[1:]:
+        if fit.cost - best.cost >= SAME_MINIMUM:
+            break
+        n = 2 * fit.problem.terms
+        if (np.abs(fit.x[:n] - best.x[:n]) > 0.2 * np.abs(best.x[:n])).any():
+            film = fit.problem.film(fit.x)
+            pairs = ", ".join(f"mu = {m:.4g} Pa with alpha = {a:.3g}" for m, a in zip(film.mu, film.alpha, strict=True))
+            return [f"other Ogden parameters fit these data equally well, for instance {pairs}"]
+    return []
+
+
+# --- the result
+
+
+def _assemble(
+    fit: _Fit, held: Mapping[str, float], starts: tuple[int, int], notes: Sequence[str], provenance: dict[str, Any]
+) -> Identification:
+    problem, x = fit.problem, fit.x
+    free = int(fit.varied[: problem.film_parameters].sum())
+    misfit_freedom = problem.data_rows - free
+    if misfit_freedom <= 0:
+        raise IdentificationError(f"{problem.data_rows} independent values cannot determine {free} parameters")
+    probability = float(gammaincc(misfit_freedom / 2, fit.cost / 2))
+    misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
+    stated = state(problem, x, fit.at_bound, held, misfit=misfit)
+    curves = _curve_results(problem, x)
+    used = sum(curve.used for curve in curves)
+    reduced = problem.residual(x)[: problem.data_rows]
+    prior = problem.residual(x)[problem.data_rows :]
+    chi_square = float(problem.inflation * (reduced @ reduced) + prior @ prior) + sum(b.floor for b in problem.blocks)
+    effective = used / problem.correlation_time
+    fitness = chi_square / problem.inflation
+    crowding = 2.0 * free * (free + 1) / (effective - free - 1) if effective > free + 1 else math.inf
+    result = Identification(
+        material=replace(problem.film(x), source="identified from force-displacement curves"),
+        quantities=stated.quantities,
+        stretch=stated.stretch,
+        stiffness_curve=stated.stiffness_curve,
+        nuisance=stated.nuisance,
+        chi_square=chi_square,
+        freedom=used - free,
+        lack_of_fit=fit.cost,
+        lack_of_fit_freedom=misfit_freedom,
+        lack_of_fit_probability=probability,
+        noise_ratio=math.sqrt(problem.noise_variance),
+        samples_per_independent=problem.correlation_time,
+        parameters=stated.parameters,
+        correlation=stated.correlation,
+        condition=stated.condition,
+        aicc=fitness + 2.0 * free + crowding,
+        bic=fitness + free * math.log(effective),
+        curves=curves,
+        starts=starts[0],
+        starts_agreeing=starts[1],
+        warnings=[],
+        provenance=provenance,
+    )
+    return replace(result, warnings=[*_warnings(result, problem, fit), *notes])
+
+
+def _curve_results(problem: Problem, x: Array) -> list[CurveResult]:
+    states = problem.states(x)
+    film = problem.film(x)
+    results = []
+    for i, (curve, selection) in enumerate(zip(problem.curves, problem.selections, strict=True)):
+        rms = expected = lag1 = error = math.nan
+        loading: float | None = None
+        unloading: float | None = None
+        if i in problem.active:
+            row = problem.active.index(i)
+            residual, sigma, _ = problem.samples(row, x, states)
+            direction = curve.direction[selection.used]
+            rms, expected = float(np.sqrt(np.mean(residual**2))), float(np.sqrt(np.mean(sigma**2)))
+            lag1 = float(residual[1:] @ residual[:-1] / (residual @ residual)) if residual.size > 1 else math.nan
+            loading, unloading = (
+                float(residual[direction == way].mean()) if (direction == way).any() else None for way in (1, -1)
+            )
+            error = _interpolation_error(problem, row, film)
+        results.append(
+            CurveResult(
+                label=curve.label,
+                run=curve.run,
+                specimen=curve.specimen.name,
+                nominal_voltage=curve.nominal_voltage,
+                samples=curve.h.size,
+                used=int(selection.used.sum()),
+                excluded=dict(selection.excluded),
+                rms_residual=rms,
+                rms_expected=expected,
+                lag1_autocorrelation=lag1,
+                mean_residual_loading=loading,
+                mean_residual_unloading=unloading,
+                interpolation_error=error,
+            )
+        )
+    return results
+
+
+def _interpolation_error(problem: Problem, row: int, film: Material) -> float:
+    """Largest difference (N) between the interpolant of a curve and the model, midway between its nodes."""
+    nodes = problem.nodes[row]
+    specimen = problem.curves[problem.active[row]].specimen.with_material(film)
+    between = 0.5 * (nodes[1:] + nodes[:-1])
+    ends = np.array([problem.selections[problem.active[row]].low, problem.selections[problem.active[row]].high])
+    points = np.concatenate((ends, between))
+    at_nodes = solve_many(specimen, nodes, problem.voltage[row], tolerance=TOLERANCE).force
+    direct = solve_many(specimen, points, problem.voltage[row], tolerance=TOLERANCE).force
+    return float(np.abs(interpolation_matrix(nodes, points) @ at_nodes - direct).max())
+
+
+def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
+    words = []
+    if not fit.converged:
+        words.append(f"the fit did not converge in {fit.evaluations} evaluations; its numbers are provisional")
+    for name, quantity in result.quantities.items():
+        if quantity.at_bound:
+            words.append(f"{name} ended at the edge of its allowed range: it is not determined by this data")
+        elif quantity.verdict.startswith("not"):
+            words.append(
+                f"{name} is not determined by this data: "
+                f"its standard uncertainty is {quantity.relative:.0%} of its value"
+            )
+    if result.lack_of_fit_probability < SIGNIFICANT:
+        ratio = math.sqrt(result.lack_of_fit / result.lack_of_fit_freedom)
+        words.append(
+            f"the model does not explain the data within their noise (lack of fit {ratio:.1f} times what noise would "
+            f"give, probability {result.lack_of_fit_probability:.1g}); the uncertainties contain an allowance for it, "
+            "but a wrong model has errors that no uncertainty covers"
+        )
+    if problem.excess > 1.0:
+        words.append(
+            f"the samples scatter {result.noise_ratio:.2f} times as much as stated; "
+            "the uncertainties were enlarged by that"
+        )
+    if result.samples_per_independent > 1.0:
+        words.append(
+            f"neighbouring samples are correlated: {result.used} samples count as "
+            f"{result.used / result.samples_per_independent:.0f} independent ones"
+        )
+    for curve, measured in zip(result.curves, problem.curves, strict=True):
+        words += _curve_warnings(curve, measured.direction, result.samples_per_independent)
+    for name, quantity in result.nuisance.items():
+        prior = next(p for k, r, p, _ in problem.zeros if name == f"{k.replace('_', ' ')} of {r}")
+        if abs(quantity.value) > 3.0 * prior:
+            words.append(
+                f"the {name} had to move by {quantity.value / prior:+.1f} of its stated standard uncertainties; "
+                "was it taken in contact, or did it drift?"
+            )
+    if not problem.electric and any(curve.nominal_voltage != 0.0 for curve in problem.curves):
+        words.append("no sample with voltage is left after the exclusions: the permittivity was not identified")
+    return words
+
+
+def _curve_warnings(curve: CurveResult, direction: NDArray[np.int8], per_independent: float) -> list[str]:
+    words = []
+    if curve.used < curve.samples:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in curve.excluded.items())
+        words.append(f"{curve.label}: {curve.samples - curve.used} of {curve.samples} samples left out ({reasons})")
+    if curve.interpolation_error > 0.1 * curve.rms_expected:
+        words.append(
+            f"{curve.label}: the interpolation between model states is off by {curve.interpolation_error:.1g} N"
+        )
+    if curve.mean_residual_loading is not None and curve.mean_residual_unloading is not None:
+        loop = curve.mean_residual_loading - curve.mean_residual_unloading
+        counts = [max(1, int((direction == way).sum())) for way in (1, -1)]
+        error = curve.rms_expected * math.sqrt(per_independent * sum(1 / count for count in counts))
+        if abs(loop) > 4.0 * error:
+            words.append(
+                f"{curve.label}: loading lies {loop * 1e3:+.2f} mN above unloading on average (hysteresis); "
+                "the model has none and runs between them"
+            )
+    return words

@@ -1,0 +1,214 @@
+"""From samples to as few numbers as carry the same information about the model.
+
+A curve of the model is smooth in the displacement, so its values ``f`` at a few Chebyshev nodes give it everywhere:
+``F(h_i) = sum_j B_ij f_j`` with the barycentric matrix ``B``. With ``W = diag(1/sigma_i)`` and the thin factorisation
+``W B = Q R`` the misfit of any ``f`` to n samples is
+
+    chi2(f) = |R f - Q^T W y|^2 + (|W y|^2 - |Q^T W y|^2)
+
+so ``R`` and ``Q^T W y`` replace the samples in a fit, whose cost then does not depend on n. The second part is what no
+smooth curve can explain: it measures the noise. The first part tests the model alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.curve import Curve
+from model.materials import Material
+from model.membrane import Status, solve_many
+
+Array = NDArray[np.float64]
+
+GRID = 33  # states at which the loss of tension is looked for along a curve
+CONTACT_MARGIN = 3.0  # standard uncertainties of the displacement zero
+VOLTAGE_MARGIN = 0.1  # of the nominal voltage; farther off, the output was ramping or had tripped
+
+
+def chebyshev_nodes(low: float, high: float, count: int) -> Array:
+    """Chebyshev nodes of the first kind between ``low`` and ``high``, ascending; shape (count,)."""
+    angle = (2 * np.arange(count) + 1) * np.pi / (2 * count)
+    return 0.5 * (low + high) - 0.5 * (high - low) * np.cos(angle)
+
+
+def interpolation_matrix(nodes: Array, points: Array) -> Array:
+    """Barycentric interpolation from first-kind Chebyshev nodes to ``points``; shape (points, nodes)."""
+    count = nodes.size
+    weights = (-1.0) ** np.arange(count) * np.sin((2 * np.arange(count) + 1) * np.pi / (2 * count))
+    difference = points[:, None] - nodes[None, :]
+    hit = difference == 0.0
+    terms = weights / np.where(hit, 1.0, difference)
+    matrix: Array = terms / terms.sum(axis=1, keepdims=True)
+    rows = hit.any(axis=1)
+    matrix[rows] = hit[rows]
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Which samples of a curve the taut membrane model can describe.
+
+    ``excluded`` counts the others by reason. ``low`` and ``high`` (m) bound the displacements of the ones used.
+    """
+
+    used: NDArray[np.bool_]
+    excluded: dict[str, int]
+    low: float
+    high: float
+
+
+def select(curves: Sequence[Curve], material: Material) -> list[Selection]:
+    """Leave out samples without a value, flagged ones, those before contact, and those where ``material`` is not taut.
+
+    Of each curve the stretch of displacements with the most samples in which the film is taut throughout is kept.
+    """
+    return [_select(curve, material) for curve in curves]
+
+
+def _select(curve: Curve, material: Material) -> Selection:
+    excluded: dict[str, int] = {}
+    used = np.ones(curve.h.size, dtype=np.bool_)
+
+    def drop(which: NDArray[np.bool_], reason: str) -> None:
+        nonlocal used
+        count = int((used & which).sum())
+        if count:
+            excluded[reason] = excluded.get(reason, 0) + count
+        used = used & ~which
+
+    if curve.flagged is not None:
+        drop(curve.flagged, "flagged by an instrument")
+    drop(~curve.usable, "without a value")
+    off = np.abs(np.abs(curve.voltage) - abs(curve.nominal_voltage)) > VOLTAGE_MARGIN * abs(curve.nominal_voltage)
+    drop(off & (curve.nominal_voltage != 0.0), "away from the nominal voltage")
+    # Closer than this to the zero the tip may not touch the film yet, and a free tip pulls with no force.
+    drop(curve.h < CONTACT_MARGIN * curve.displacement_zero, "before contact")
+    if not used.any():
+        return Selection(used, excluded, 0.0, 0.0)
+    grid = np.linspace(curve.h[used].min(), max(curve.h[used].max(), curve.h[used].min() + 1e-9), GRID)
+    specimen = curve.specimen.with_material(material)
+    status = solve_many(specimen, grid, reference_voltage(curve, used)).status
+    taut = status == Status.TAUT
+    if not taut.all():
+        state = np.full(curve.h.size, -1)
+        place = (curve.h[used] - grid[0]) / (grid[-1] - grid[0]) * (GRID - 1)
+        state[used] = status[np.rint(place).astype(np.intp)]
+        first, last = _longest(taut, curve.h[used], grid)
+        outside = (curve.h < first) | (curve.h > last)
+        for value in np.unique(state[used]):
+            reason = "next to a state that is not taut" if value == Status.TAUT else Status(value).name.lower()
+            drop((state == value) & outside, reason.replace("_", " "))
+    if not used.any():
+        return Selection(used, excluded, 0.0, 0.0)
+    return Selection(used, excluded, float(curve.h[used].min()), float(curve.h[used].max()))
+
+
+def _longest(taut: NDArray[np.bool_], h: Array, grid: Array) -> tuple[float, float]:
+    """Ends of the run of taut grid points with the most samples; an empty interval if there is none."""
+    best, ends = 0, (np.inf, -np.inf)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], taut.astype(np.int8), [0]))))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        low, high = float(grid[start]), float(grid[stop - 1])
+        count = int(((h >= low) & (h <= high)).sum())
+        if count > best:
+            best, ends = count, (low, high)
+    return ends
+
+
+def reference_voltage(curve: Curve, used: NDArray[np.bool_]) -> float:
+    """The voltage at which the model is evaluated: the root mean square, because the force is nearly linear in V^2.
+
+    Exactly 0 where the protocol asked for 0 V: what a meter reads there is its own noise.
+    """
+    if curve.nominal_voltage == 0.0:
+        return 0.0
+    return float(np.sqrt(np.mean(curve.voltage[used] ** 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Samples of one curve in one direction, reduced: ``chi2 = |root @ f - target|^2 + floor``.
+
+    ``curve`` is the index of the curve, ``samples`` its number of samples, ``noise`` their residuals to the smooth
+    curve nearest to them, in standard deviations.
+    """
+
+    curve: int
+    samples: int
+    root: Array  # (k, nodes)
+    target: Array  # (k,)
+    floor: float
+    noise: Array  # (samples,)
+
+
+@dataclass(frozen=True, eq=False)
+class NodeModel:
+    """The model at the nodes of a curve: force, and its derivatives by displacement (N/m) and voltage (N/V)."""
+
+    force: Array
+    by_h: Array
+    by_voltage: Array
+
+
+def reduce(index: int, curve: Curve, selection: Selection, nodes: Array, voltage: float, at: NodeModel) -> list[Block]:
+    """Reduce the used samples of a curve, loading and unloading apart.
+
+    ``at`` is the latest knowledge of the model at ``nodes`` and ``voltage``. It carries each sample from its own
+    voltage to ``voltage`` and turns the noise of the displacement into one of the force.
+    """
+    blocks = []
+    for direction in (1, 0, -1):
+        rows = selection.used & (curve.direction == direction)
+        if not rows.any():
+            continue
+        matrix = interpolation_matrix(nodes, curve.h[rows])
+        force = curve.force[rows]
+        if voltage > 0.0:
+            by_square = at.by_voltage / (2 * voltage)
+            force = force - matrix @ by_square * (curve.voltage[rows] ** 2 - voltage**2)
+        sigma = np.hypot(curve.force_noise, matrix @ at.by_h * curve.displacement_noise)
+        matrix /= sigma[:, None]
+        force = force / sigma
+        base, root = np.linalg.qr(matrix)
+        target = base.T @ force
+        noise = force - base @ target
+        blocks.append(
+            Block(
+                curve=index,
+                samples=int(rows.sum()),
+                root=root,
+                target=target,
+                floor=float(noise @ noise),
+                noise=noise,
+            )
+        )
+    return blocks
+
+
+def noise_ratio(blocks: Sequence[Block]) -> tuple[float, int]:
+    """Variance about the nearest smooth curves, in units of the stated one, and its degrees of freedom."""
+    freedom = sum(block.samples - block.root.shape[0] for block in blocks)
+    return (sum(block.floor for block in blocks) / freedom if freedom else 1.0), freedom
+
+
+def correlation_time(blocks: Sequence[Block]) -> float:
+    """How many samples carry the information of one independent sample: ``1 + 2 sum_k rho_k``, at least 1.
+
+    The autocorrelation ``rho_k`` of the noise, pooled over all blocks, is summed until it can no longer be told from
+    zero (two standard deviations, and three for the first).
+    """
+    total = sum(block.floor for block in blocks)
+    count = sum(block.samples for block in blocks)
+    if total <= 0.0:
+        return 1.0
+    time = 1.0
+    for lag in range(1, max(block.samples for block in blocks) // 4):
+        rho = sum(float(block.noise[lag:] @ block.noise[:-lag]) for block in blocks) / total
+        if rho < (3.0 if lag == 1 else 2.0) / np.sqrt(count):
+            break
+        time += 2.0 * rho
+    return time

@@ -1,0 +1,213 @@
+"""What identification says about a film, and its form as plain JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from model.materials import Material
+
+CONVENTION = "W = sum mu_n/alpha_n (l1^alpha_n + l2^alpha_n + (l1 l2)^-alpha_n - 3), G = 1/2 sum mu_n alpha_n"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One identified number.
+
+    ``uncertainty`` is the combined standard uncertainty (k = 1); ``budget`` holds its independent parts, which add in
+    squares. ``verdict`` is "identified", "weakly identified" or "not identifiable from this data".
+    """
+
+    value: float
+    uncertainty: float
+    unit: str
+    budget: dict[str, float]
+    verdict: str
+    at_bound: bool = False
+
+    @property
+    def relative(self) -> float:
+        """Uncertainty over value; inf for a value of zero."""
+        return self.uncertainty / abs(self.value) if self.value else math.inf
+
+
+@dataclass(frozen=True)
+class CurveResult:
+    """What became of one curve. Residuals are measurement minus model, in newtons."""
+
+    label: str
+    run: str
+    specimen: str
+    nominal_voltage: float
+    samples: int
+    used: int
+    excluded: dict[str, int]
+    rms_residual: float
+    rms_expected: float
+    lag1_autocorrelation: float
+    mean_residual_loading: float | None
+    mean_residual_unloading: float | None
+    interpolation_error: float
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """Secant shear modulus against meridional stretch, at a hoop stretch equal to the pre-stretch (Pa)."""
+
+    meridional_stretch: tuple[float, ...]
+    hoop_stretch: float
+    secant_modulus: tuple[float, ...]
+    uncertainty: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Everything that a set of curves says about a film.
+
+    Attributes
+    ----------
+    material : Material
+        The film with the identified parameters. Without voltage in the data its ``eps_r`` is the starting guess.
+    quantities : dict of str to Quantity
+        ``mu1``, ``alpha1``, ... sorted by exponent, ``G``, ``stiffness`` and, with voltage in the data, ``eps_r``.
+    stretch : (float, float)
+        Meridional and hoop stretch to which ``stiffness`` belongs; see `secant_modulus`.
+    stiffness_curve : Stiffness
+        The same over the range of stretch that the data reach.
+    nuisance : dict of str to Quantity
+        Zeros of force (N) and displacement (m) of every run, as corrections to what was measured.
+    chi_square, freedom : float, int
+        Of all samples, in their stated standard deviations.
+    lack_of_fit, lack_of_fit_freedom, lack_of_fit_probability : float, int, float
+        Misfit that smooth curves would not have, in the noise found, and the probability of as much by chance.
+    noise_ratio : float
+        Scatter about the nearest smooth curves over the stated standard deviation.
+    samples_per_independent : float
+        1 for independent samples; the fit counts n samples as n over this.
+    parameters, correlation : list of str, list of list of float
+        Correlations of the raw parameters.
+    condition : float
+        Condition number of the least-squares problem in relative changes of the raw parameters.
+    aicc, bic : float
+        Information criteria; smaller is better, differences below 2 mean nothing.
+    """
+
+    material: Material
+    quantities: dict[str, Quantity]
+    stretch: tuple[float, float]
+    stiffness_curve: Stiffness
+    nuisance: dict[str, Quantity]
+    chi_square: float
+    freedom: int
+    lack_of_fit: float
+    lack_of_fit_freedom: int
+    lack_of_fit_probability: float
+    noise_ratio: float
+    samples_per_independent: float
+    parameters: list[str]
+    correlation: list[list[float]]
+    condition: float
+    aicc: float
+    bic: float
+    curves: list[CurveResult]
+    starts: int
+    starts_agreeing: int
+    warnings: list[str]
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def terms(self) -> int:
+        """Number of Ogden terms."""
+        return len(self.material.mu)
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """Chi-square per degree of freedom; near 1 when model and stated noise are right."""
+        return self.chi_square / self.freedom
+
+    @property
+    def used(self) -> int:
+        """Samples in the fit."""
+        return sum(curve.used for curve in self.curves)
+
+    @property
+    def excluded(self) -> int:
+        """Samples left out."""
+        return sum(curve.samples - curve.used for curve in self.curves)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings, lists and dictionaries; a number that is not finite becomes None."""
+        return {
+            "format": "dea-rig identification 1",
+            "convention": CONVENTION,
+            "terms": self.terms,
+            "quantities": {name: _quantity_dict(q) for name, q in self.quantities.items()},
+            "stiffness_at": {"meridional_stretch": self.stretch[0], "hoop_stretch": self.stretch[1]},
+            "stiffness_curve": {
+                "meridional_stretch": list(self.stiffness_curve.meridional_stretch),
+                "hoop_stretch": self.stiffness_curve.hoop_stretch,
+                "secant_modulus_Pa": list(self.stiffness_curve.secant_modulus),
+                "standard_uncertainty_Pa": list(self.stiffness_curve.uncertainty),
+            },
+            "nuisance": {name: _quantity_dict(q) for name, q in self.nuisance.items()},
+            "chi_square": self.chi_square,
+            "degrees_of_freedom": self.freedom,
+            "reduced_chi_square": self.reduced_chi_square,
+            "lack_of_fit": {
+                "chi_square": self.lack_of_fit,
+                "degrees_of_freedom": self.lack_of_fit_freedom,
+                "probability": self.lack_of_fit_probability,
+            },
+            "noise_ratio": self.noise_ratio,
+            "samples_per_independent_sample": self.samples_per_independent,
+            "samples_used": self.used,
+            "samples_excluded": self.excluded,
+            "parameters": self.parameters,
+            "correlation": self.correlation,
+            "condition_number": _finite(self.condition),
+            "aicc": self.aicc,
+            "bic": self.bic,
+            "starts": self.starts,
+            "starts_agreeing": self.starts_agreeing,
+            "curves": [
+                {
+                    "label": c.label,
+                    "run": c.run,
+                    "specimen": c.specimen,
+                    "nominal_voltage_V": c.nominal_voltage,
+                    "samples": c.samples,
+                    "samples_used": c.used,
+                    "excluded": c.excluded,
+                    "rms_residual_N": _finite(c.rms_residual),
+                    "rms_expected_N": _finite(c.rms_expected),
+                    "lag1_autocorrelation": _finite(c.lag1_autocorrelation),
+                    "mean_residual_loading_N": c.mean_residual_loading,
+                    "mean_residual_unloading_N": c.mean_residual_unloading,
+                    "interpolation_error_N": _finite(c.interpolation_error),
+                }
+                for c in self.curves
+            ],
+            "warnings": self.warnings,
+            "provenance": self.provenance,
+        }
+
+    def to_json(self) -> str:
+        """`to_dict` as JSON text."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
+
+
+def _quantity_dict(quantity: Quantity) -> dict[str, Any]:
+    return {
+        "value": _finite(quantity.value),
+        "standard_uncertainty": _finite(quantity.uncertainty),
+        "unit": quantity.unit,
+        "budget": {part: _finite(value) for part, value in quantity.budget.items()},
+        "verdict": quantity.verdict,
+        "at_bound": quantity.at_bound,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
