@@ -35,3 +35,7 @@ class Stopped(RigError):
     """The operator ended the run."""
 
     exit_code = 130
+
+
+class DataError(RigError):
+    """Logs from which what was asked cannot be worked out."""

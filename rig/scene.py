@@ -21,6 +21,7 @@ from rig.table import Table
 from rig.toml_file import load_table
 
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 
 
 class MaterialTable(Table):
@@ -62,6 +63,10 @@ class SpecimenTable(Table):
     thickness_um: Positive
     prestretch: float = Field(ge=1.0, le=6.0)
     material: str | MaterialTable
+    # Standard uncertainties of the dimensions; at 0 the results are stated for the dimensions as given.
+    disk_radius_uncertainty_mm: NotNegative = 0.0
+    thickness_uncertainty_um: NotNegative = 0.0
+    prestretch_uncertainty: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _sensible(self) -> Self:

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.table import Table
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from calibration.result import Identification
     from rig.experiment import Experiment
+    from rig.identification import Found
 
 
 def show(*tables: RenderableType) -> None:
     """Print to standard output; as wide as the terminal, at least 100 columns where there is none."""
     console = Console()
     if not console.is_terminal:
-        console = Console(width=max(console.width, 110))
+        console = Console(width=max(console.width, 120))
     for table in tables:
         console.print(table)
 
@@ -54,3 +56,61 @@ def plan_table(experiment: Experiment) -> Table:
 
 def _minutes(seconds: float) -> str:
     return f"{int(seconds // 60)} min {seconds % 60:.0f} s"
+
+
+def identification_table(found: Identification) -> Group:
+    """The identified quantities with their standard uncertainties and verdicts, and what speaks against them."""
+    table = Table(title=f"Identified with {found.terms} Ogden terms, {found.used} samples, {found.excluded} left out")
+    table.add_column("quantity")
+    table.add_column("value", justify="right")
+    table.add_column("standard uncertainty", justify="right")
+    table.add_column("relative", justify="right")
+    table.add_column("verdict")
+    for name, quantity in found.quantities.items():
+        table.add_row(
+            _NAMES.get(name, name),
+            f"{quantity.value:.5g} {quantity.unit}".strip(),
+            f"{quantity.uncertainty:.2g} {quantity.unit}".strip(),
+            f"{100 * quantity.relative:.2g} %",
+            quantity.verdict + (" (at its bound)" if quantity.at_bound else ""),
+        )
+    lines: list[RenderableType] = [
+        table,
+        f"reduced chi-square {found.reduced_chi_square:.3f} ({found.freedom} degrees of freedom); stiffness is the "
+        f"secant shear modulus at stretches {found.stretch[0]:.2f} (meridional) and {found.stretch[1]:.2f} (hoop).",
+    ]
+    lines += [f"note: {warning}" for warning in found.warnings]
+    return Group(*lines)
+
+
+def truth_table(found: Found) -> RenderableType:
+    """The simulation's hidden truth beside what was identified, the difference in stated standard uncertainties."""
+    from calibration.identify import secant_modulus
+
+    truth, identification = found.truth, found.identification
+    if truth is None:
+        return ""
+    known = {
+        "eps_r": truth.eps_r,
+        "stiffness": secant_modulus(truth, *identification.stretch),
+        "G": truth.shear_modulus,
+    }
+    if len(truth.mu) == identification.terms:
+        for n, (mu, alpha) in enumerate(sorted(zip(truth.mu, truth.alpha, strict=True), key=lambda term: term[1])):
+            known |= {f"mu{n + 1}": mu, f"alpha{n + 1}": alpha}
+    table = Table(title="Truth against identified")
+    for heading in ("quantity", "truth", "identified", "uncertainty", "difference in uncertainties"):
+        table.add_column(heading, justify="left" if heading == "quantity" else "right")
+    for name, quantity in identification.quantities.items():
+        if name in known:
+            table.add_row(
+                _NAMES.get(name, name),
+                f"{known[name]:.5g}",
+                f"{quantity.value:.5g} {quantity.unit}".strip(),
+                f"{100 * quantity.relative:.2g} %",
+                f"{(quantity.value - known[name]) / quantity.uncertainty:+.2f}",
+            )
+    return table
+
+
+_NAMES = {"eps_r": "permittivity eps_r", "stiffness": "stiffness the data determine", "G": "shear modulus G"}

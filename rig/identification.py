@@ -1,0 +1,137 @@
+"""From logs to parameters: curves out of logs, one identification over all of them, results as JSON and HTML."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibration.certificate import Certificate, CertificateError, parse_certificate
+from calibration.curve import Curve, CurveError
+from calibration.identify import IdentificationError, identify
+from calibration.result import Identification
+from model.materials import Material
+from rig.errors import ConfigError, DataError
+from rig.log.dataset import CurveErrors, Run, load_run
+from rig.scene import Scene
+from rig.toml_file import parse_table
+
+
+@dataclass(frozen=True)
+class Found:
+    """An identification with what it came from.
+
+    ``truth`` is the hidden film of the simulation, when all logs are of one and the same simulated film.
+    """
+
+    identification: Identification
+    curves: list[Curve]
+    runs: list[Run]
+    provenance: dict[str, object]
+    truth: Material | None
+
+
+def identify_logs(paths: Sequence[Path], *, terms: int = 2) -> Found:
+    """Identify the film from all recorded curves of all logs at once.
+
+    Raises
+    ------
+    LogError, DataError
+        When a log cannot be read, lacks what is needed, or the curves cannot be fitted.
+    """
+    runs = [load_run(path) for path in paths]
+    scenes = [parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)") for run in runs]
+    provenance: dict[str, object] = {
+        "logs": {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths},
+        "outcomes": {run.log.path.name: (run.log.outcome or {}).get("status", "cut off") for run in runs},
+    }
+    curves: list[Curve] = []
+    try:
+        for run, scene in zip(runs, scenes, strict=True):
+            curves += run.curves(scene.specimen.specimen(), **_errors(run, scene))
+        if not curves:
+            raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
+        identification = identify(curves, terms=terms, provenance=provenance)
+    except (CurveError, IdentificationError, CertificateError) as error:
+        raise DataError(f"{error}.") from None
+    return Found(identification, curves, runs, provenance, _truth(scenes))
+
+
+def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
+    """Write the result as JSON and as an HTML report; each appears whole or not at all.
+
+    Raises
+    ------
+    ConfigError
+        When a file cannot be written.
+    """
+    try:
+        if fit is not None:
+            part = fit.with_name(fit.name + ".part")
+            part.write_text(found.identification.to_json(), encoding="utf-8")
+            part.replace(fit)
+        if report is not None:
+            from calibration.report import write_report
+
+            write_report(
+                report,
+                found.identification,
+                found.curves,
+                scene_texts={run.log.path.name: run.scene for run in found.runs},
+                provenance=found.provenance,
+                truth=found.truth,
+            )
+    except OSError as error:
+        raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None
+
+
+def _errors(run: Run, scene: Scene) -> CurveErrors:
+    """Noise and uncertainties of a run's curves, from the certificates in its log and from the scene."""
+    certificates = _certificates(run)
+    force = certificates.get("force")
+    if force is None:
+        raise DataError(f"{run.log.path}: the log holds no certificate of the force sensor; its noise is not known.")
+    dimensions = scene.specimen
+    errors = CurveErrors(
+        force_noise=force.noise,
+        force_gain=force.gain_uncertainty,
+        thickness_uncertainty=dimensions.thickness_uncertainty_um / dimensions.thickness_um,
+        prestretch_uncertainty=dimensions.prestretch_uncertainty / dimensions.prestretch,
+        disk_radius_uncertainty=dimensions.disk_radius_uncertainty_mm / dimensions.disk_radius_mm,
+    )
+    laser, hv = certificates.get("displacement"), certificates.get("hv")
+    if laser is not None:
+        errors["displacement_noise"] = laser.noise
+        errors["displacement_gain"] = laser.gain_uncertainty
+    if hv is not None:
+        errors["voltage_gain"] = hv.gain_uncertainty
+    return errors
+
+
+def _certificates(run: Run) -> dict[str, Certificate]:
+    found = {}
+    for name, attachment in run.log.attachments.items():
+        if name.startswith("certificate."):
+            certificate = parse_certificate(attachment.data, f"{run.log.path} ({name} inside)")
+            found[certificate.role] = certificate
+    return found
+
+
+def _truth(scenes: Sequence[Scene]) -> Material | None:
+    truths = set()
+    for scene in scenes:
+        if scene.simulation is None or scene.on_real_ports:
+            return None
+        film, believed = scene.simulation.film, scene.specimen.specimen().material
+        truths.add(
+            (
+                tuple(film.mu_Pa) if film.mu_Pa is not None else believed.mu,
+                tuple(film.alpha) if film.alpha is not None else believed.alpha,
+                film.eps_r if film.eps_r is not None else believed.eps_r,
+            )
+        )
+    if len(truths) != 1:
+        return None
+    mu, alpha, eps_r = truths.pop()
+    return Material(name="the simulation's truth", mu=mu, alpha=alpha, eps_r=eps_r)
