@@ -17,13 +17,18 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from drivers.link import DeviceSilent
+from drivers.link import ByteLink, DeviceSilent, FrameLink
 
 Q = TypeVar("Q")
 R = TypeVar("R")
 
 # How soon to look again while an answer is outstanding, for loops that cannot wait on the port itself.
 LOOK_AGAIN_S = 1e-3
+
+
+def label(name: str, link: ByteLink | FrameLink) -> str:
+    """Name of a device for messages, with its port."""
+    return name if link.name in ("", name) else f"{name} ({link.name})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ value yet. ``TG,a,+01.2345`` may be pushed at any time.
 
 **What corruption cannot be seen.** There is neither checksum nor message number. A digit that has turned into another
 digit, or a sign that has flipped, is a valid value as long as it stays within ``limit_mm``; so is a refusal whose code
-has changed. Every other change of a single byte, and every lost or added one, makes a line that fits the grammar or the
-question no longer, and it is dropped and counted. Because two answers to the same command look alike, the driver asks for ``M1`` and ``M0`` in
-turn: a duplicated answer, or one that arrives after its question was given up, meets the other question and is
-dropped. Only an answer that is late by two questions would be taken for a new one.
+has changed. Every other change of a single byte, and every lost or added one, makes a line that fits the grammar or
+the question no longer, and it is dropped and counted. Because two answers to the same command look alike, the driver
+asks for ``M1`` and ``M0`` in turn: a duplicated answer, or one that arrives after its question was given up, meets the
+other question and is dropped. Only an answer that is late by two questions would be taken for a new one.
 
 Source: Keyence LK-G series user's manual, RS-232C communication; settings as used by DESY (cmstkmodlab).
 """
@@ -28,7 +28,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import NoReturn, TypeVar
 
-from drivers.dialogue import Answer, Ask, Dialogue, Schedule, Script
+from drivers.dialogue import Answer, Ask, Dialogue, Schedule, Script, label
 from drivers.link import ByteLink, DeviceError, DeviceRefused
 from drivers.roles import OK, DisplacementSample, Identity, SampleFlag
 
@@ -228,7 +228,7 @@ class KeyenceLKG:
             "unexpected_replies": 0,
             "mode_restored": 0,
         }
-        self._label = f"{name} ({link.name})"
+        self._label = label(name, link)
         self._link = link
         self._output = output
         self._rate = poll_rate_Hz

@@ -26,7 +26,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
-from drivers.dialogue import Answer, Ask, Dialogue, Schedule, Script
+from drivers.dialogue import Answer, Ask, Dialogue, Schedule, Script, label
 from drivers.link import ByteLink, DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import Identity, StageSample
 
@@ -327,7 +327,7 @@ class ZaberStage:
         self.identity = Identity()
         self.settings: dict[str, str] = {}
         self.counters: dict[str, int] = {"alerts": 0, "infos": 0, "unexpected_replies": 0}
-        self._label = f"{name} ({link.name})"
+        self._label = label(name, link)
         self._link = link
         self._device, self._axis = device, axis
         self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
