@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 
@@ -66,7 +67,7 @@ def assert_in_order(out: list[tuple[float, int]], truth: dict[int, float]) -> No
 
 
 def assert_increasing(out: list[tuple[float, int]]) -> None:
-    assert all(b[0] > a[0] for a, b in zip(out, out[1:], strict=False))
+    assert all(b[0] > a[0] for a, b in itertools.pairwise(out))
 
 
 @pytest.mark.parametrize("drift", [0.0, 100e-6, -100e-6])
@@ -84,7 +85,7 @@ def test_times_follow_the_sampling_instants_under_jitter_and_drift(drift: float)
 def test_neighbours_never_differ_by_a_period_from_the_period_without_an_event() -> None:
     out, counters, _, _ = stream(drift=80e-6, seconds=30, spikes=0.2)
     assert counters["gaps"] == counters["time_resyncs"] == 0
-    assert all(0 < b[0] - a[0] < 0.02 for a, b in zip(out, out[1:], strict=False))
+    assert all(0 < b[0] - a[0] < 0.02 for a, b in itertools.pairwise(out))
 
 
 @pytest.mark.parametrize("missing", [1, 2, 7, 40])
