@@ -73,13 +73,13 @@ class ContainerWriter:
     def chunk_is_empty(self) -> bool:
         return not self._messages
 
-    def add_channel(self, topic: str, schema_name: str, schema_data: bytes, metadata: Mapping[str, str]) -> int:
+    def add_channel(self, topic: str, schema_name: str, schema_data: bytes) -> int:
         """Describe a channel of protobuf messages; the number to give to `add_message`."""
         same = [schema for schema in self._schemas if (schema.name, schema.data) == (schema_name, schema_data)]
         schema = same[0] if same else Schema(len(self._schemas) + 1, schema_data, "protobuf", schema_name)
         if not same:
             self._schemas.append(schema)
-        channel = Channel(len(self._channels) + 1, topic, "protobuf", dict(metadata), schema.id)
+        channel = Channel(len(self._channels) + 1, topic, "protobuf", {}, schema.id)
         self._channels.append(channel)
         self._sequence.append(0)
         self._described.append(_record(schema) + _record(channel))

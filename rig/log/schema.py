@@ -161,6 +161,13 @@ def schema_name(topic: str) -> str:
     return f"{PACKAGE}.{CHANNELS[topic].message}"
 
 
+def meanings() -> dict[str, str]:
+    """What every field of every message means, by ``Message.field``; each log carries it."""
+    return {
+        f"{channel.message}.{field.name}": field.meaning for channel in CHANNELS.values() for field in channel.fields
+    }
+
+
 @cache
 def schema_data(topic: str) -> bytes:
     """The serialised FileDescriptorSet that describes the message on ``topic``."""

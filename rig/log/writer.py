@@ -60,6 +60,7 @@ class LogWriter:
         try:
             self._container = ContainerWriter(self._put)
             self.metadata("log", {"schema_version": str(schema.SCHEMA_VERSION), "package": schema.PACKAGE})
+            self.metadata("fields", schema.meanings())
         except LogError:
             self.part.unlink(missing_ok=True)
             raise
@@ -92,8 +93,7 @@ class LogWriter:
             )
         channel = self._channels.get(topic)
         if channel is None:
-            meta = {field.name: field.meaning for field in schema.CHANNELS[topic].fields}
-            channel = self._container.add_channel(topic, schema.schema_name(topic), schema.schema_data(topic), meta)
+            channel = self._container.add_channel(topic, schema.schema_name(topic), schema.schema_data(topic))
             self._channels[topic] = channel
         self._container.add_message(channel, data, log_ns, publish_ns)
 

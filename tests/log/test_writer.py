@@ -48,7 +48,7 @@ def test_the_stock_reader_reads_it(small, samples):
         assert set(seen.values()) == {20}
         (attachment,) = reader.iter_attachments()
         assert (attachment.name, attachment.data) == ("scene.toml", b'title = "small"\n')
-        assert [record.name for record in reader.iter_metadata()] == ["log", "run", "outcome"]
+        assert [record.name for record in reader.iter_metadata()] == ["log", "fields", "run", "outcome"]
     with small.open("rb") as file:
         assert list(StreamReader(file, validate_crcs=True).records)  # checks the data checksum too
 
@@ -221,7 +221,7 @@ def full_after(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(writer.os, "write", write)
 
 
-@pytest.mark.parametrize("limit", [5_000, 5_001, 7_777, 20_000])
+@pytest.mark.parametrize("limit", [7_000, 7_001, 9_777, 20_000])
 def test_a_full_disk_ends_the_log_for_good(tmp_path, monkeypatch, limit):
     path = tmp_path / "a.mcap"
     full_after(limit, monkeypatch)
