@@ -39,6 +39,7 @@ SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
 SHARE_BOUNDS = (1e-6, 100.0)
 EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
 PERMITTIVITY_BOUNDS = (0.5, 200.0)
+SEARCH, FINAL = (1e-6, 40), (1e-9, 200)  # relative decrease of chi-square and evaluations that end a fit
 AT_BOUND = 1e-4  # distance to a bound, relative to the distance of the bounds
 SAME_MINIMUM = 0.5  # chi-square by which two minima may differ and count as one
 
@@ -49,6 +50,7 @@ def identify(
     terms: int = 2,
     starts: int = 6,
     seed: int = 0,
+    negative_exponents: bool = False,
     fixed: Mapping[str, float] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Identification:
@@ -62,6 +64,8 @@ def identify(
         Number of Ogden terms.
     starts : int
         Starting points; the first is the material of the specimens, the others are drawn with ``seed``.
+    negative_exponents : bool
+        Let every third starting point have ``alpha_1 < 0`` (and ``mu_1 < 0``). A sign never changes during a fit.
     fixed : mapping of str to float, optional
         ``alpha1``... and ``eps_r`` that are known and not to be fitted, e.g. ``{"eps_r": 1.7}``.
     provenance : mapping, optional
@@ -92,17 +96,17 @@ def identify(
     for number in range(PASSES):
         problem = Problem(curves, selections, terms, material)
         if not fits:
-            guesses = _starting_materials(material, terms, starts, seed, held)
+            guesses = _starting_materials(material, terms, starts, seed, held, negative_exponents)
             points = [problem.vector(_scaled(start, curves)) for start in guesses]
             fits = sorted(
-                (fit for fit in (_minimise(problem, x, held) for x in points) if fit is not None),
+                (fit for fit in (_minimise(problem, x, held, SEARCH) for x in points) if fit is not None),
                 key=lambda fit: fit.cost,
             )
             if not fits:
                 raise IdentificationError("no fit converged from any starting point; is the specimen's geometry right?")
             best = fits[0]
         else:
-            again = _minimise(problem, best.restarted(problem), held)
+            again = _minimise(problem, best.restarted(problem), held, FINAL)
             best = best if again is None else again
         material = problem.film(best.x)
         previous, selections = selections, select(curves, material)
@@ -112,13 +116,12 @@ def identify(
     else:
         notes.append("the set of samples at which the film is taut did not settle while fitting")
     notes += _other_minima(fits)
-    agreeing = sum(fit.cost - fits[0].cost < SAME_MINIMUM for fit in fits)
     record = {
         "data": dict(provenance or {}),
         "settings": {"terms": terms, "starts": starts, "seed": seed, "fixed": held},
         "software": {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")},
     }
-    return _assemble(best, held, (len(fits), agreeing), notes, record)
+    return _assemble(best, fits, held, notes, record)
 
 
 def compare(curves: Sequence[Curve], *, terms: Sequence[int] = (1, 2, 3), **options: Any) -> list[Identification]:
@@ -163,9 +166,9 @@ def _scaled(material: Material, curves: Sequence[Curve]) -> Material:
 
 
 def _starting_materials(
-    guess: Material, terms: int, count: int, seed: int, held: Mapping[str, float]
+    guess: Material, terms: int, count: int, seed: int, held: Mapping[str, float], negative: bool
 ) -> list[Material]:
-    """The guess, where it has as many terms, and random sets with the same modulus; every third with alpha_1 < 0."""
+    """The guess, where it has as many terms, and random sets with the same modulus."""
     random = np.random.default_rng(seed)
     sets: list[tuple[Array, Array]] = []
     mu, alpha = np.array(guess.mu), np.array(guess.alpha)
@@ -173,7 +176,7 @@ def _starting_materials(
         sets.append((mu * alpha / 2.0, alpha))
     while len(sets) < count:
         alpha = np.sort(np.exp(random.uniform(math.log(1.2), math.log(12.0), terms)))
-        if terms > 1 and len(sets) % 3 == 2:
+        if negative and terms > 1 and len(sets) % 3 == 2:
             alpha[0] *= -1.0
         sets.append((guess.shear_modulus * random.dirichlet(np.ones(terms)), alpha))
     materials = []
@@ -209,7 +212,7 @@ class _Fit:
         return self.problem.film_parameters
 
 
-def _minimise(problem: Problem, start: Array, held: Mapping[str, float]) -> _Fit | None:
+def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort: tuple[float, int]) -> _Fit | None:
     """Least squares from one starting point; None where the model has no answer there."""
     import lmfit
 
@@ -225,6 +228,8 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float]) -> _Fit
     varied = np.array([name not in held for name in problem.names])
     margin = np.where(np.isfinite(upper - lower), 1e-3 * (upper - lower), 0.0)
     start = np.where(varied, np.clip(start, lower + np.minimum(margin, 1e-3), upper - margin), start)
+    while problem.electric and "eps_r" not in held and not problem.answers(start) and start[2 * n] > 1.0:
+        start[2 * n] *= 0.7  # a film this soft cannot hold the voltage with that permittivity
     if not problem.answers(start):
         return None
 
@@ -241,6 +246,7 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float]) -> _Fit
     def jacobian(values: Any) -> Array:
         return problem.jacobian(vector(values))[:, varied]
 
+    tolerance, budget = effort
     # scale_covar off: the weights come from calibration, and a misfit must show as one.
     minimiser = lmfit.Minimizer(residual, parameters, scale_covar=False, nan_policy="raise")
     with python_warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -248,7 +254,7 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float]) -> _Fit
         # identifiable. Ours (`_Covariance`) is used instead.
         python_warnings.simplefilter("ignore")
         out = minimiser.minimize(
-            method="least_squares", jac=jacobian, x_scale="jac", ftol=1e-10, xtol=1e-9, gtol=1e-9, max_nfev=200
+            method="least_squares", jac=jacobian, x_scale="jac", ftol=tolerance, xtol=1e-9, gtol=1e-9, max_nfev=budget
         )
     x = vector(out.params)
     if not problem.answers(x):
@@ -290,8 +296,9 @@ def _other_minima(fits: Sequence[_Fit]) -> list[str]:
 
 
 def _assemble(
-    fit: _Fit, held: Mapping[str, float], starts: tuple[int, int], notes: Sequence[str], provenance: dict[str, Any]
+    fit: _Fit, fits: Sequence[_Fit], held: Mapping[str, float], notes: Sequence[str], provenance: dict[str, Any]
 ) -> Identification:
+    """The result of ``fit``; ``fits`` are the minima from all starting points, best first."""
     problem, x = fit.problem, fit.x
     free = int(fit.varied[: problem.film_parameters].sum())
     misfit_freedom = problem.data_rows - free
@@ -299,7 +306,8 @@ def _assemble(
         raise IdentificationError(f"{problem.data_rows} independent values cannot determine {free} parameters")
     probability = float(gammaincc(misfit_freedom / 2, fit.cost / 2))
     misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
-    stated = state(problem, x, fit.at_bound, held, misfit=misfit)
+    rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits[1:]]
+    stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals)
     curves = _curve_results(problem, x)
     used = sum(curve.used for curve in curves)
     reduced = problem.residual(x)[: problem.data_rows]
@@ -327,8 +335,8 @@ def _assemble(
         aicc=fitness + 2.0 * free + crowding,
         bic=fitness + free * math.log(effective),
         curves=curves,
-        starts=starts[0],
-        starts_agreeing=starts[1],
+        starts=len(fits),
+        starts_agreeing=sum(other.cost - fits[0].cost < SAME_MINIMUM for other in fits),
         warnings=[],
         provenance=provenance,
     )
@@ -394,8 +402,7 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
             words.append(f"{name} ended at the edge of its allowed range: it is not determined by this data")
         elif quantity.verdict.startswith("not"):
             words.append(
-                f"{name} is not determined by this data: "
-                f"its standard uncertainty is {quantity.relative:.0%} of its value"
+                f"{name} is not determined by this data: its standard uncertainty is {_share(quantity.relative)}"
             )
     if result.lack_of_fit_probability < SIGNIFICANT:
         ratio = math.sqrt(result.lack_of_fit / result.lack_of_fit_freedom)
@@ -416,11 +423,10 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
         )
     for curve, measured in zip(result.curves, problem.curves, strict=True):
         words += _curve_warnings(curve, measured.direction, result.samples_per_independent)
-    for name, quantity in result.nuisance.items():
-        prior = next(p for k, r, p, _ in problem.zeros if name == f"{k.replace('_', ' ')} of {r}")
-        if abs(quantity.value) > 3.0 * prior:
+    for name, zero in result.nuisance.items():
+        if abs(zero.value) > 3.0 * zero.prior:
             words.append(
-                f"the {name} had to move by {quantity.value / prior:+.1f} of its stated standard uncertainties; "
+                f"the {name} had to move by {zero.value / zero.prior:+.1f} of its stated standard uncertainties; "
                 "was it taken in contact, or did it drift?"
             )
     if not problem.electric and any(curve.nominal_voltage != 0.0 for curve in problem.curves):
@@ -428,9 +434,13 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
     return words
 
 
+def _share(relative: float) -> str:
+    return f"{relative:.0%} of its value" if relative <= 10.0 else "more than ten times its value"
+
+
 def _curve_warnings(curve: CurveResult, direction: NDArray[np.int8], per_independent: float) -> list[str]:
     words = []
-    if curve.used < curve.samples:
+    if curve.samples - curve.used > curve.excluded.get("before contact", 0):
         reasons = ", ".join(f"{count} {reason}" for reason, count in curve.excluded.items())
         words.append(f"{curve.label}: {curve.samples - curve.used} of {curve.samples} samples left out ({reasons})")
     if curve.interpolation_error > 0.1 * curve.rms_expected:

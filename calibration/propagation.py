@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.problem import Problem
-from calibration.result import Quantity, Stiffness
+from calibration.result import Quantity, Stiffness, Zero
 from model.materials import Material
 
 Array = NDArray[np.float64]
@@ -73,12 +74,25 @@ class Covariance:
 
 
 class Propagation:
-    """Standard uncertainties of functions of the parameters, part by part."""
+    """Standard uncertainties of functions of the film's parameters, part by part.
 
-    def __init__(self, problem: Problem, x: Array, free: NDArray[np.bool_], misfit: float) -> None:
+    ``misfit`` is the chi-square of the lack of fit over its expectation; ``rivals`` are other minima with their
+    likelihood relative to this one.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        x: Array,
+        free: NDArray[np.bool_],
+        misfit: float,
+        rivals: Sequence[tuple[Material, float]],
+    ) -> None:
         self.problem = problem
+        self.film = problem.film(x)
         self.covariance = Covariance(problem, x, free)
         self.misfit = misfit
+        self.rivals = rivals
         self.effects: dict[str, Array] = {}
         states = problem.states(x)
         for part, uncertainty, scales in SYSTEMATIC:
@@ -96,20 +110,16 @@ class Propagation:
         return np.array([[getattr(self.problem.curves[i].specimen, name)] for i in self.problem.active])
 
     def quantity(
-        self, value: float, gradient: Array, unit: str, *, at_bound: bool = False, known: bool = True
+        self, of: Callable[[Material], float], gradient: Array, unit: str, *, at_bound: bool = False, known: bool = True
     ) -> Quantity:
-        """A function of x with this value and gradient; ``known=False`` when nothing in the data bears on it."""
-        rows = gradient @ self.covariance.response
-        data = self.problem.data_rows
-        budget = {"noise": float(np.linalg.norm(rows[:data]))}
-        for kind in ("force_zero", "displacement_zero"):
-            mine = [data + k for k, zero in enumerate(self.problem.zeros) if zero[0] == kind]
-            if mine:
-                budget[kind.replace("_", " ")] = float(np.linalg.norm(rows[mine]))
-        if self.misfit > 1.0:
-            budget["lack of fit"] = budget["noise"] * math.sqrt(self.misfit - 1.0)
-        for part, effect in self.effects.items():
-            budget[part] = abs(float(gradient @ effect))
+        """``of(film)``, whose gradient by x is given; ``known=False`` when nothing in the data bears on it."""
+        value = of(self.film)
+        budget = self.budget(gradient)
+        weights = 1.0 + sum(weight for _, weight in self.rivals)
+        spread = sum(weight * (of(film) - value) ** 2 for film, weight in self.rivals) / weights
+        # Minima in one valley are described by its curvature already; only what goes beyond that is added.
+        if spread > budget["noise"] ** 2:
+            budget["other solutions"] = math.sqrt(spread - budget["noise"] ** 2)
         total = math.hypot(*budget.values()) if known else math.inf
         relative = total / abs(value) if value else math.inf
         if relative <= IDENTIFIED and not at_bound:
@@ -120,13 +130,28 @@ class Propagation:
             verdict = "not identifiable from this data"
         return Quantity(value, total, unit, budget, verdict, at_bound)
 
+    def budget(self, gradient: Array) -> dict[str, float]:
+        """Independent parts of the standard uncertainty of a function of x with this gradient."""
+        rows = gradient @ self.covariance.response
+        data = self.problem.data_rows
+        parts = {"noise": float(np.linalg.norm(rows[:data]))}
+        for kind in ("force_zero", "displacement_zero"):
+            mine = [data + k for k, zero in enumerate(self.problem.zeros) if zero[0] == kind]
+            if mine:
+                parts[kind.replace("_", " ")] = float(np.linalg.norm(rows[mine]))
+        if self.misfit > 1.0:
+            parts["lack of fit"] = parts["noise"] * math.sqrt(self.misfit - 1.0)
+        for part, effect in self.effects.items():
+            parts[part] = abs(float(gradient @ effect))
+        return parts
+
 
 @dataclass(frozen=True, eq=False)
 class Statement:
     """Everything that is derived from a minimum by linear propagation."""
 
     quantities: dict[str, Quantity]
-    nuisance: dict[str, Quantity]
+    nuisance: dict[str, Zero]
     stretch: tuple[float, float]
     stiffness_curve: Stiffness
     parameters: list[str]
@@ -135,63 +160,74 @@ class Statement:
 
 
 def state(
-    problem: Problem, x: Array, at_bound: NDArray[np.bool_], held: Mapping[str, float], *, misfit: float = 1.0
+    problem: Problem,
+    x: Array,
+    at_bound: NDArray[np.bool_],
+    held: Collection[str],
+    *,
+    misfit: float = 1.0,
+    rivals: Sequence[tuple[Material, float]] = (),
 ) -> Statement:
+    """Quantities with uncertainties at ``x``; ``at_bound`` marks entries of x, ``held`` names those that were given."""
     n = problem.terms
-    film = problem.film(x)
-    mu, alpha = np.array(film.mu), np.array(film.alpha)
     vanished = at_bound[:n]  # a term without stiffness says nothing about its exponent
     free = np.array([name not in held for name in problem.names])
     free[n : 2 * n] &= ~vanished
-    propagation = Propagation(problem, x, free, misfit)
+    propagation = Propagation(problem, x, free, misfit, rivals)
+    film = propagation.film
+    mu, alpha = np.array(film.mu), np.array(film.alpha)
+    zero, unit = np.zeros(n), np.eye(n)
 
     def gradient(by_mu: Array, by_alpha: Array, by_eps: float = 0.0) -> Array:
         return problem.by_parameters(x, by_mu, by_alpha, np.array(by_eps))
 
-    zero, unit = np.zeros(n), np.eye(n)
     quantities: dict[str, Quantity] = {}
-    raw: dict[str, tuple[float, Array]] = {}
+    slopes: dict[str, Array] = {}
     for k in range(n):
-        raw[f"mu{k + 1}"] = (mu[k], gradient(unit[k], zero))
-        if f"alpha{k + 1}" not in held:
-            raw[f"alpha{k + 1}"] = (alpha[k], gradient(zero, unit[k]))
-    for name, (value, slope) in raw.items():
-        k = int(name[-1]) - 1
-        edge = bool(at_bound[k] if name.startswith("mu") else at_bound[n + k] or vanished[k])
-        known = not (name.startswith("alpha") and vanished[k])
+        name = f"mu{k + 1}"
+        slopes[name] = gradient(unit[k], zero)
         quantities[name] = propagation.quantity(
-            float(value), slope, "Pa" if name.startswith("mu") else "1", at_bound=edge, known=known
+            partial(_entry, "mu", k), slopes[name], "Pa", at_bound=bool(vanished[k])
         )
-    quantities["G"] = propagation.quantity(film.shear_modulus, gradient(alpha / 2.0, mu / 2.0), "Pa")
+        name = f"alpha{k + 1}"
+        if name not in held:
+            slopes[name] = gradient(zero, unit[k])
+            quantities[name] = propagation.quantity(
+                partial(_entry, "alpha", k),
+                slopes[name],
+                "1",
+                at_bound=bool(vanished[k] or at_bound[n + k]),
+                known=not vanished[k],
+            )
+    quantities["G"] = propagation.quantity(lambda m: m.shear_modulus, gradient(alpha / 2.0, mu / 2.0), "Pa")
 
     hoop = float(np.mean([problem.curves[i].specimen.prestretch for i in problem.active]))
     longest = max(float(problem.states(x).max_stretch.max()), hoop + 0.02)
     stretches = np.arange(math.floor(hoop * 100) + 1, math.floor(longest * 100) + 1) / 100
-    modulus, by_mu, by_alpha = _secant(mu, alpha, stretches, hoop)
+    _, by_mu, by_alpha = _secant(mu, alpha, stretches, hoop)
     along = [
-        propagation.quantity(float(m), gradient(a, b), "Pa") for m, a, b in zip(modulus, by_mu, by_alpha, strict=True)
+        propagation.quantity(partial(secant_modulus, meridional=stretch, hoop=hoop), gradient(a, b), "Pa")
+        for stretch, a, b in zip(stretches, by_mu, by_alpha, strict=True)
     ]
     at = min(range(len(along)), key=lambda k: along[k].relative)
     quantities["stiffness"] = along[at]
     if problem.electric and "eps_r" not in held:
-        slope = gradient(zero, zero, 1.0)
-        raw["eps_r"] = (film.eps_r, slope)
-        quantities["eps_r"] = propagation.quantity(film.eps_r, slope, "1", at_bound=bool(at_bound[2 * n]))
+        slopes["eps_r"] = gradient(zero, zero, 1.0)
+        quantities["eps_r"] = propagation.quantity(
+            lambda m: m.eps_r, slopes["eps_r"], "1", at_bound=bool(at_bound[2 * n])
+        )
 
     nuisance = {}
     for k, (kind, run, prior, _) in enumerate(problem.zeros, start=problem.film_parameters):
         slope = np.zeros(x.size)
         slope[k] = prior
-        unit_name = "N" if kind == "force_zero" else "m"
-        quantity = propagation.quantity(float(x[k] * prior), slope, unit_name)
-        nuisance[f"{kind.replace('_', ' ')} of {run}"] = replace(quantity, verdict=f"prior {prior:.3g} {unit_name}")
-
-    slopes = np.array([slope for _, slope in raw.values()])
-    covariance = slopes @ propagation.covariance.matrix @ slopes.T
-    deviation = np.sqrt(np.diag(covariance))
-    deviation[deviation == 0.0] = 1.0
-    correlation = covariance / np.outer(deviation, deviation)
-    np.fill_diagonal(correlation, 1.0)
+        budget = propagation.budget(slope)
+        nuisance[f"{kind.replace('_', ' ')} of {run}"] = Zero(
+            value=float(x[k] * prior),
+            uncertainty=math.hypot(*budget.values()),
+            prior=prior,
+            unit="N" if kind == "force_zero" else "m",
+        )
     return Statement(
         quantities=quantities,
         nuisance=nuisance,
@@ -202,10 +238,24 @@ def state(
             secant_modulus=tuple(q.value for q in along),
             uncertainty=tuple(q.uncertainty for q in along),
         ),
-        parameters=list(raw),
-        correlation=[[float(value) for value in row] for row in correlation],
+        parameters=list(slopes),
+        correlation=_correlation(np.array(list(slopes.values())), propagation.covariance.matrix),
         condition=_condition(problem, x, free),
     )
+
+
+def _entry(name: str, k: int, film: Material) -> float:
+    return float(getattr(film, name)[k])
+
+
+def _correlation(slopes: Array, covariance: Array) -> list[list[float]]:
+    """Correlation matrix of functions of x with these gradients; 0 beside a function without uncertainty."""
+    own = slopes @ covariance @ slopes.T
+    deviation = np.sqrt(np.diag(own))
+    deviation[deviation == 0.0] = 1.0
+    matrix = own / np.outer(deviation, deviation)
+    np.fill_diagonal(matrix, 1.0)
+    return [[float(value) for value in row] for row in matrix]
 
 
 def _condition(problem: Problem, x: Array, free: NDArray[np.bool_]) -> float:

@@ -34,6 +34,19 @@ class Quantity:
 
 
 @dataclass(frozen=True)
+class Zero:
+    """A correction to the zero of force or displacement in one run, found with the film's parameters.
+
+    ``prior`` is the standard uncertainty that was stated for it, ``uncertainty`` the one that is left.
+    """
+
+    value: float
+    uncertainty: float
+    prior: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class CurveResult:
     """What became of one curve. Residuals are measurement minus model, in newtons."""
 
@@ -76,7 +89,7 @@ class Identification:
         Meridional and hoop stretch to which ``stiffness`` belongs; see `secant_modulus`.
     stiffness_curve : Stiffness
         The same over the range of stretch that the data reach.
-    nuisance : dict of str to Quantity
+    nuisance : dict of str to Zero
         Zeros of force (N) and displacement (m) of every run, as corrections to what was measured.
     chi_square, freedom : float, int
         Of all samples, in their stated standard deviations.
@@ -98,7 +111,7 @@ class Identification:
     quantities: dict[str, Quantity]
     stretch: tuple[float, float]
     stiffness_curve: Stiffness
-    nuisance: dict[str, Quantity]
+    nuisance: dict[str, Zero]
     chi_square: float
     freedom: int
     lack_of_fit: float
@@ -151,7 +164,15 @@ class Identification:
                 "secant_modulus_Pa": list(self.stiffness_curve.secant_modulus),
                 "standard_uncertainty_Pa": list(self.stiffness_curve.uncertainty),
             },
-            "nuisance": {name: _quantity_dict(q) for name, q in self.nuisance.items()},
+            "nuisance": {
+                name: {
+                    "value": zero.value,
+                    "standard_uncertainty": zero.uncertainty,
+                    "stated_standard_uncertainty": zero.prior,
+                    "unit": zero.unit,
+                }
+                for name, zero in self.nuisance.items()
+            },
             "chi_square": self.chi_square,
             "degrees_of_freedom": self.freedom,
             "reduced_chi_square": self.reduced_chi_square,
