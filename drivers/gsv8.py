@@ -7,9 +7,9 @@ Frames, big-endian, all beginning with AA and ending with 85 (n = number of data
     measured  AA 1k SS v1..           SS status: bit 7 set, bits 6..4 type (1 int16, 2 int24, 3 float32),
                                       bit 1 six-axis error, bit 0 input overload
 
-After power-up the amplifier streams by itself. A float is the user scale times the bridge signal; an integer is the
-unscaled signal in binary-offset coding (ME-Messsysteme, MEGSV86x64.h). Sources: gsv86lib 0.1.1 and MEGSV86x64.h, both
-by the manufacturer.
+After power-up the amplifier streams by itself. An integer is the bridge signal as a fraction of full scale, in
+binary-offset coding; a float is the signal in input ranges, times the user scale, plus the user offset. Sources:
+gsv86lib 0.1.1 and MEGSV86x64.h, both by the manufacturer.
 
 What this protocol cannot show
     There is no checksum, no counter, no time stamp, and an answer does not say which request it answers. A changed bit
@@ -49,6 +49,7 @@ START_TRANSMISSION = 0x24
 GET_VALUE = 0x3B
 SET_ZERO = 0x0C
 READ_USER_SCALE = 0x14
+READ_USER_OFFSET = 0x9A
 GET_SERIAL_NUMBER = 0x1F
 GET_FIRMWARE_VERSION = 0x2B
 SET_TX_MODE = 0x81
@@ -62,6 +63,7 @@ COMMANDS = {
     GET_VALUE: "GetValue",
     SET_ZERO: "SetZero",
     READ_USER_SCALE: "ReadUserScale",
+    READ_USER_OFFSET: "ReadUserOffset",
     GET_SERIAL_NUMBER: "GetSerialNo",
     GET_FIRMWARE_VERSION: "GetFirmwareVersion",
     SET_TX_MODE: "SetTXMode",
@@ -259,11 +261,11 @@ class GSV8:
     The set-up dialogue stops the stream, reads serial number, firmware, input range and user scale, sets frame type
     and data rate, reads both back (the frame type from a frame), and starts the stream.
 
-    The reading is the bridge signal in mV/V: a float divided by the user scale that was read back, or an integer times
-    the input range. What the user scale multiplies is not documented beyond doubt; ``user_scale_of`` says it:
-
-    - ``"mV/V"``: value = user scale * signal in mV/V;
-    - ``"range"``: value = user scale * signal / input range, as the manufacturer's helper for setting it implies.
+    The reading is the bridge signal in mV/V. For floats it is ``(value - user offset) / user scale``, times the input
+    range: the manufacturer's header calls a float the product of user scale and raw value, and his helper sets the
+    scale to capacity / sensitivity * input range. Where a device should prove that its user scale multiplies the
+    signal in mV/V itself, ``user_scale_of = "mV/V"`` leaves the input range out. For integers it is the value times
+    the input range. Check the scale once with a known weight or a bridge simulator.
 
     A value that is not finite or lies beyond twice the input range, in a frame that does not report an overload, is
     dropped and counted (``bad_values``) and leaves its place in time empty. A frame that reports an overload is flagged
@@ -301,7 +303,7 @@ class GSV8:
         frame_type: FrameType = "float32",
         timeout_s: float = 0.25,
         poll_interval_s: float = 0.01,
-        user_scale_of: Literal["mV/V", "range"] = "mV/V",
+        user_scale_of: Literal["range", "mV/V"] = "range",
         input_range_mV_per_V: float | None = None,
         int_full_scale: float = 1.05,
     ) -> None:
@@ -504,22 +506,29 @@ class GSV8:
                 f"input range unknown: GetInputType answered {reply.meaning}",
                 "State input_range_mV_per_V in the scene.",
             )
-        data = yield from self._demand(READ_USER_SCALE, channel, lengths=(4,))
-        (scale,) = struct.unpack(">f", data)
-        self.settings["user_scale"] = f"{scale:.9g}"
+        scale = yield from self._read_float(READ_USER_SCALE, channel, "user_scale")
+        offset = yield from self._read_float(READ_USER_OFFSET, channel, "user_offset")
         if self._frame_type == "float32":
-            if not (math.isfinite(scale) and scale != 0):
+            if not (math.isfinite(scale) and scale != 0 and math.isfinite(offset)):
                 raise DeviceRefused(
-                    self.name, f"user scale of channel {self._channel} is {scale}", "Set it in the amplifier, to 1 say."
+                    self.name,
+                    f"user scale of channel {self._channel} is {scale:g}, its user offset {offset:g}",
+                    "Set them in the amplifier, to 1 and 0 say.",
                 )
             self._gain = (self._range if self._user_scale_of == "range" and self._range else 1.0) / scale
-            self._offset = 0.0
+            self._offset = offset
         else:
             assert self._range is not None
             self._offset = float(1 << (8 * _WIDTH[self._frame_type] - 1))
             self._gain = self._range * self._int_full_scale / self._offset
         self._limit = 2.0 * self._range if self._range is not None else _UNKNOWN_RANGE_LIMIT
         self.settings["mV_per_V_per_unit"] = f"{self._gain:.9g}"
+
+    def _read_float(self, command: int, channel: bytes, key: str) -> Generator[_Step, _Got, float]:
+        data = yield from self._demand(command, channel, lengths=(4,))
+        value = float(struct.unpack(">f", data)[0])
+        self.settings[key] = f"{value:.9g}"
+        return value
 
     def _check_frame(self) -> Generator[_Step, _Got, None]:
         """One measured frame on request: it shows type and number of channels, and the stream is held to them."""
