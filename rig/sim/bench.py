@@ -1,0 +1,264 @@
+"""The simulated bench: instruments around one hidden truth, moved through time event by event.
+
+Everything random comes from the seed, one stream an instrument. What an instrument sends depends on what it was told
+and when, never on how often the bench was asked.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import zlib
+from collections.abc import Collection
+from typing import Protocol
+
+import numpy as np
+
+from model.specimen import Specimen
+from rig.sim.faults import Upset
+from rig.sim.film import Solve, solve_membrane
+from rig.sim.gsv8 import GSV8
+from rig.sim.iseg import IsegEDCP
+from rig.sim.keyence import KeyenceLKG
+from rig.sim.settings import LINK_FAULTS, Fault, LinkTruth, SimulationSettings
+from rig.sim.wire import ByteWire, FrameWire
+from rig.sim.world import World
+from rig.sim.zaber import ZaberStage
+
+ROLES = ("stage", "force", "displacement", "hv")
+
+Instrument = ZaberStage | GSV8 | KeyenceLKG | IsegEDCP
+
+
+class _Timed(Protocol):
+    """Something that acts by itself."""
+
+    @property
+    def next_time(self) -> float: ...
+
+    def advance(self, t: float) -> None: ...
+
+
+class SimulatedBench:
+    """The instruments of ``roles`` (stage, force, displacement, hv) and the specimen between them.
+
+    Attributes
+    ----------
+    world : World
+        The hidden truth.
+    instruments : dict
+        By role, for tests and faults.
+    now : float
+        The time up to which everything has happened.
+    """
+
+    def __init__(
+        self,
+        settings: SimulationSettings,
+        specimen: Specimen,
+        roles: Collection[str],
+        *,
+        solve: Solve = solve_membrane,
+    ) -> None:
+        unknown = set(roles) - set(ROLES)
+        if unknown:
+            raise ValueError(f"no simulated instrument for {', '.join(sorted(unknown))}; there are {', '.join(ROLES)}")
+        self.settings = settings
+        self.world = World(settings, specimen, "hv" in roles, solve)
+        self.instruments: dict[str, Instrument] = {}
+        self._bytes: dict[str, ByteWire] = {}
+        self._frames: dict[str, FrameWire] = {}
+        self._upsets: dict[tuple[str, str], Upset] = {}
+        self.now = 0.0
+        for role in ROLES:
+            if role in roles:
+                self._build(role)
+        # The order of things that happen at one time: sensors see the world as it was, then it moves on.
+        self._sensors: list[_Timed] = [self.instruments[r] for r in ("force", "displacement") if r in roles]
+        self._actors: list[_Timed] = [self.world, *(self.instruments[r] for r in ("stage", "hv") if r in roles)]
+        self._wires: list[ByteWire | FrameWire] = [*self._bytes.values(), *self._frames.values()]
+        self._due: list[tuple[float, int, bool, Fault]] = []
+        self._injected = 0
+        for fault in settings.fault:
+            if fault.role in roles:
+                self.inject(fault)
+
+    def _rng(self, name: str) -> np.random.Generator:
+        return np.random.default_rng([self.settings.seed & 0xFFFF_FFFF_FFFF_FFFF, zlib.crc32(name.encode())])
+
+    def _build(self, role: str) -> None:
+        s = self.settings
+        if role == "hv":
+            bus = FrameWire(s.hv.latency_ms * 1e-3, s.hv.bitrate)
+            self._frames[role] = bus
+            self.instruments[role] = IsegEDCP(s.hv, self.world, bus, self._rng(role))
+            return
+        wire = _wire({"stage": s.stage.link, "force": s.force.link, "displacement": s.displacement.link}[role])
+        self._bytes[role] = wire
+        match role:
+            case "stage":
+                self.instruments[role] = ZaberStage(s.stage, self.world, wire)
+            case "force":
+                self.instruments[role] = GSV8(s.force, self.world, wire, self._rng(role))
+            case "displacement":
+                self.instruments[role] = KeyenceLKG(s.displacement, self.world, wire, self._rng(role))
+
+    def wire(self, role: str) -> ByteWire | FrameWire:
+        """The wire to the instrument of ``role``; the host uses its ``host_write`` and ``host_read``."""
+        return self._frames[role] if role in self._frames else self._bytes[role]
+
+    # Time
+
+    def _next_action(self) -> float:
+        due = min((thing.next_time for thing in self._actors), default=math.inf)
+        for wire in self._wires:
+            due = min(due, wire.next_delivery)
+        return min(due, self._due[0][0]) if self._due else due
+
+    def next_time(self) -> float:
+        """When something happens next by itself, or arrives at either end of a wire; inf if nothing will."""
+        due = min((sensor.next_time for sensor in self._sensors), default=math.inf)
+        for wire in self._wires:
+            due = min(due, wire.next_arrival)
+        return min(due, self._next_action())
+
+    def advance(self, t: float) -> None:
+        """Let everything up to time ``t`` happen, in the order of time."""
+        while True:
+            step = max(min(self._next_action(), t), self.now)
+            for sensor in self._sensors:
+                sensor.advance(step)
+            for actor in self._actors:
+                actor.advance(step)
+            for role in self.instruments:
+                self._deliver(role, step)
+            while self._due and self._due[0][0] <= step:
+                _, number, begins, fault = heapq.heappop(self._due)
+                self._switch(fault, number, begins, step)
+            self.now = step
+            if step >= t and self._next_action() > t:
+                return
+
+    def _deliver(self, role: str, t: float) -> None:
+        instrument = self.instruments[role]
+        if isinstance(instrument, IsegEDCP):
+            for arrived, frame in self._frames[role].deliveries(t):
+                instrument.receive(frame, arrived)
+        else:
+            for arrived, data in self._bytes[role].deliveries(t):
+                instrument.receive(data, arrived)
+
+    # Faults
+
+    def inject(self, fault: Fault) -> None:
+        """Let something go wrong, from ``fault.at_s`` on, or from now on if that has passed."""
+        if fault.role not in self.instruments:
+            raise ValueError(f"there is no {fault.role} on this bench to go wrong")
+        self._injected += 1
+        begin = max(fault.at_s, self.now)
+        heapq.heappush(self._due, (begin, 2 * self._injected, True, fault))
+        if fault.duration_s is not None:
+            heapq.heappush(self._due, (begin + fault.duration_s, 2 * self._injected + 1, False, fault))
+
+    def _switch(self, fault: Fault, number: int, begins: bool, t: float) -> None:
+        if fault.kind == "vanish":
+            wire = self.wire(fault.role)
+            if begins:
+                wire.cut()
+            else:
+                wire.restore()
+        elif fault.kind in LINK_FAULTS:
+            self._switch_upset(fault, number // 2, begins)
+        else:
+            self._switch_device(fault, begins, t)
+
+    def _switch_upset(self, fault: Fault, number: int, begins: bool) -> None:
+        directions = ["from_device", "to_device"] if fault.direction == "both" else [fault.direction]
+        if fault.kind == "silent":
+            directions = ["from_device"]
+        wire = self.wire(fault.role)
+        for direction in directions:
+            upset = self._upsets.setdefault((fault.role, direction), Upset())
+            if begins:
+                upset.add(fault, self._rng(f"fault {number} {direction}"))
+            else:
+                upset.remove(fault)
+            if isinstance(wire, FrameWire):
+                hook = upset.on_bus if len(upset) else None
+                if direction == "from_device":
+                    wire.upset_from_device = hook
+                else:
+                    wire.upset_to_device = hook
+            else:
+                bytes_hook = upset.on_line if len(upset) else None
+                if direction == "from_device":
+                    wire.upset_from_device = bytes_hook
+                else:
+                    wire.upset_to_device = bytes_hook
+
+    def _switch_device(self, fault: Fault, begins: bool, t: float) -> None:
+        instrument = self.instruments[fault.role]
+        if fault.kind == "reset":
+            if begins:
+                instrument.reset(t)
+            return
+        if fault.kind == "freeze":
+            instrument.freeze(t, begins)
+            return
+        match instrument:
+            case ZaberStage():
+                if fault.kind == "alert":
+                    self._alert(instrument, fault, begins, t)
+                else:
+                    instrument.wrong_status = "FS" if begins else None
+            case GSV8():
+                if fault.kind == "saturate":
+                    instrument.saturated = (-1 if fault.value is not None and fault.value < 0 else 1) if begins else 0
+                else:
+                    instrument.wrong_status = (3 if fault.value is None else int(fault.value) & 3) if begins else 0
+            case KeyenceLKG():
+                match fault.kind:
+                    case "alert":
+                        self._alert(instrument, fault, begins, t)
+                    case "saturate":
+                        sign = -1 if fault.value is not None and fault.value < 0 else 1
+                        instrument.saturated = sign if begins else 0
+                    case "no_value":
+                        instrument.no_value = begins
+                    case _:
+                        instrument.wrong_status = begins
+            case IsegEDCP():
+                self._switch_supply(instrument, fault, begins, t)
+
+    def _alert(self, instrument: ZaberStage | KeyenceLKG, fault: Fault, begins: bool, t: float) -> None:
+        """Unsolicited lines: one, or one every ``value`` seconds for the duration of the fault."""
+        if not begins:
+            return
+        instrument.alert(t)
+        if fault.duration_s is not None:
+            period = fault.value or 0.1
+            rest = fault.duration_s - period
+            if rest > 0:
+                self.inject(fault.model_copy(update={"at_s": t + period, "duration_s": rest}))
+
+    def _switch_supply(self, supply: IsegEDCP, fault: Fault, begins: bool, t: float) -> None:
+        match fault.kind:
+            case "stuck_on":
+                supply.stuck_on = begins
+            case "breakdown":
+                self.world.broken_down = begins
+            case "over_current":
+                leak = supply.nominal_i * 2 if fault.value is None else fault.value
+                self.world.extra_leakage = leak if begins else 0.0
+            case "sag":
+                supply.set_sag(t, (0.5 if fault.value is None else fault.value) if begins else 1.0)
+            case "interlock":
+                supply.open_interlock(t, begins)
+            case "inhibit":
+                supply.inhibit(t, begins)
+            case "wrong_status":
+                supply.wrong_status = (0xFFFF if fault.value is None else int(fault.value) & 0xFFFF) if begins else 0
+
+
+def _wire(link: LinkTruth) -> ByteWire:
+    return ByteWire(link.latency_ms * 1e-3, link.baud)

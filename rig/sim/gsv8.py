@@ -1,0 +1,334 @@
+"""An ME-Messsysteme GSV-8 strain-gauge amplifier on its binary serial protocol, with one load cell.
+
+Request ``AA 9n CC p1..pn 85``, answer ``AA 5n EE d1..dn 85``, measured values ``AA 1k SS v.. 85`` with k + 1 channels;
+big-endian, no escaping. It streams by itself after power-up. Integer values are raw numbers with a binary offset;
+float values are ``user scale x raw value in input ranges + user offset``, the zero taken off before scaling.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rig.sim.settings import ForceTruth
+from rig.sim.wire import ByteWire
+from rig.sim.world import World
+
+Floats = npt.NDArray[np.float64]
+
+CHANNELS: Final = 8
+INT16, INT24, FLOAT = 1, 2, 3
+WIDTH = {INT16: 2, INT24: 3, FLOAT: 4}
+# Transmission mode words, index 1 of commands 80/81. 0x0010 selects float as the vendor's library sends it.
+TYPE_OF_WORD = {1: INT16, 2: INT24, 3: FLOAT, 0x10: FLOAT}
+MAX_RATE = {INT16: 48_000.0, INT24: 24_000.0, FLOAT: 12_000.0}
+MIN_RATE = 0.1
+ANSWER_S = 1e-3
+PARAMETER_TIMEOUT_S = 0.2
+FRAME_BLOCK = 4096  # samples computed at once
+
+# Error codes
+OK, CHANGED = 0x00, 0x01
+UNKNOWN, NOT_IMPLEMENTED, FRAME_ERROR = 0x40, 0x41, 0x42
+BAD_ADDRESS, BAD_DATA, TOO_BIG, TOO_SMALL, NOT_SUPPORTED = 0x51, 0x52, 0x54, 0x55, 0x59
+TIMEOUT, WRONG_COUNT = 0x5A, 0x5B
+
+# Commands it knows and their numbers of parameters; None: known, but not built into this amplifier.
+COMMANDS: dict[int, int | None] = {
+    0x02: 1, 0x03: 5, 0x06: None, 0x07: None, 0x0A: 1, 0x0C: 1, 0x0F: 1, 0x10: 2, 0x11: 1, 0x12: None,
+    0x14: 1, 0x15: 5, 0x1F: 0, 0x23: 0, 0x24: 0, 0x26: 0, 0x27: 4, 0x2B: 0, 0x34: None, 0x3B: 0,
+    0x59: None, 0x5A: None, 0x5B: None, 0x5C: None, 0x5D: None, 0x5E: None, 0x5F: None, 0x60: None,
+    0x61: None, 0x62: None, 0x78: 0, 0x79: None, 0x80: 1, 0x81: 3, 0x8A: 0, 0x8B: 4, 0x9A: 1, 0x9B: 5,
+    0xA2: 2, 0xA3: 2,
+}  # fmt: skip
+
+BRIDGE_8V75, BRIDGE_5V, BRIDGE_2V5 = 0, 1, 2
+UNIT_MV_PER_V = 0
+
+
+class GSV8:
+    """Eight channels, one of them with the load cell, the others open.
+
+    Attributes
+    ----------
+    saturated, frozen, wrong_status : faults
+        Sign of the rail the input is stuck at (0: none); the value does not change; bits added to the status byte.
+    """
+
+    def __init__(self, settings: ForceTruth, world: World, wire: ByteWire, rng: np.random.Generator) -> None:
+        self._settings = settings
+        self._world = world
+        self._wire = wire
+        self._rng = rng
+        self._cell = settings.channel - 1
+        self._buffer = bytearray()
+        self._buffer_since = 0.0
+        self.saturated = 0
+        self.wrong_status = 0
+        self._frozen: float | None = None
+        # Kept in non-volatile memory
+        self._rate = settings.stored_rate_Hz
+        self._type = FLOAT
+        self._input_type = [BRIDGE_5V] * CHANNELS
+        self._user_scale = [settings.input_range_mV_per_V] * CHANNELS  # so that it shows mV/V
+        self._user_offset = [0.0] * CHANNELS
+        self._zero = [0.0] * CHANNELS  # mV/V
+        self._unit = [UNIT_MV_PER_V] * CHANNELS
+        self._mode = 0
+        self._permanent = True
+        self._power_up(0.0)
+
+    def _power_up(self, t: float) -> None:
+        self._buffer.clear()
+        self._transmitting = self._permanent
+        self._restart(t)
+
+    def _restart(self, t: float) -> None:
+        self._start, self._count = t, 0
+
+    def reset(self, t: float) -> None:
+        """Lose power and come back: deaf and dumb for a while, then streaming with the stored settings."""
+        self._power_up(t + self._settings.reboot_s)
+
+    def freeze(self, t: float, frozen: bool) -> None:
+        """A fault: from now on every sample has the value of time ``t``."""
+        self._frozen = float(self._bridge(np.array([t]))[0]) if frozen else None
+
+    # What it measures
+
+    def input_range(self, kind: int) -> float:
+        """Input range (mV/V) of an input type: inverse to its bridge supply."""
+        return self._settings.input_range_mV_per_V * {BRIDGE_8V75: 5 / 8.75, BRIDGE_5V: 1.0, BRIDGE_2V5: 2.0}[kind]
+
+    def _bridge(self, t: Floats) -> Floats:
+        """What the bridge puts out (mV/V) at the times ``t`` (n,), without noise."""
+        s = self._settings
+        if self._frozen is not None:
+            return np.full(t.shape, self._frozen)
+        sensitivity = s.sensitivity_mV_per_V * (1.0 + s.gain_error) / s.full_scale_N
+        return self._world.force(t) * sensitivity + s.zero_offset_mV_per_V
+
+    def _frames(self, t: Floats) -> tuple[bytes, int]:
+        """Frames for the samples at ``t``, end to end, and the length of one."""
+        s = self._settings
+        span = self.input_range(self._input_type[self._cell])
+        top = span * s.raw_range_factor
+        reading = self._bridge(t)
+        if self._frozen is None and s.noise_fraction:
+            reading = reading + s.noise_fraction * s.sensitivity_mV_per_V * self._rng.standard_normal(len(t))
+        if self.saturated:
+            reading = np.full(t.shape, math.copysign(2 * top, self.saturated))
+        overload = np.abs(reading) > top
+        reading = np.clip(reading, -top, top)
+        raw = np.rint((reading - self._zero[self._cell]) / top * 2**23)
+        raw = np.clip(raw, -(2**23), 2**23 - 1)
+        width = WIDTH[self._type]
+        size = 3 + CHANNELS * width + 1
+        frames = np.zeros((len(t), size), dtype=np.uint8)
+        frames[:, 0] = 0xAA
+        frames[:, 1] = 0x10 | (CHANNELS - 1)
+        frames[:, 2] = 0x80 | self._type << 4 | self.wrong_status
+        frames[overload, 2] |= 1
+        frames[:, -1] = 0x85
+        idle = self._encode(np.zeros(1), 0)
+        for channel in range(CHANNELS):
+            at = 3 + channel * width
+            if channel == self._cell:
+                frames[:, at : at + width] = self._encode(raw, channel)
+            else:
+                frames[:, at : at + width] = idle if self._type != FLOAT else self._encode(np.zeros(1), channel)
+        return frames.tobytes(), size
+
+    def _encode(self, raw: Floats, channel: int) -> npt.NDArray[np.uint8]:
+        """Raw 24-bit numbers (n,) as bytes (n, width) of the present value type."""
+        if self._type == FLOAT:
+            scale = self._user_scale[channel] * self._settings.raw_range_factor / 2**23
+            value = (raw * scale + self._user_offset[channel]).astype(">f4")
+            return value.view(np.uint8).reshape(-1, 4)
+        offset = (raw.astype(np.int64) + 2**23).astype(">u4").view(np.uint8).reshape(-1, 4)
+        return offset[:, 1:] if self._type == INT24 else offset[:, 1:3]
+
+    # Time
+
+    @property
+    def _period(self) -> float:
+        return 1.0 / (self._rate * (1.0 + self._settings.clock_drift_ppm * 1e-6))
+
+    @property
+    def next_time(self) -> float:
+        """When it sends by itself next."""
+        return self._start + (self._count + 1) * self._period if self._transmitting else math.inf
+
+    def advance(self, t: float) -> None:
+        """Send the frames that are due up to ``t``."""
+        if self._buffer and t > self._buffer_since + PARAMETER_TIMEOUT_S:
+            self._buffer.clear()
+            self._answer(TIMEOUT, b"", self._buffer_since + PARAMETER_TIMEOUT_S)
+        if not self._transmitting:
+            return
+        period = self._period
+        while True:
+            first = self._count + 1
+            last = min(math.floor((t - self._start) / period + 1e-9), self._count + FRAME_BLOCK)
+            if last < first:
+                return
+            times = self._start + np.arange(first, last + 1, dtype=np.float64) * period
+            data, size = self._frames(times)
+            for i, time in enumerate(times.tolist()):
+                self._wire.send(data[i * size : (i + 1) * size], time)
+            self._count = last
+
+    # Bytes in
+
+    def receive(self, data: bytes, t: float) -> None:
+        """Bytes from the host, whose last bit arrived at ``t``."""
+        if t < self._start and not self._count:  # still booting
+            return
+        if not self._buffer:
+            self._buffer_since = t
+        self._buffer += data
+        while self._buffer:
+            if self._buffer[0] != 0xAA:
+                del self._buffer[0]
+                continue
+            if len(self._buffer) < 2:
+                return
+            if self._buffer[1] & 0xF0 != 0x90:
+                del self._buffer[0]
+                continue
+            length = 4 + (self._buffer[1] & 0x0F)
+            if len(self._buffer) < length:
+                return
+            frame = bytes(self._buffer[:length])
+            if frame[-1] == 0x85:
+                del self._buffer[:length]
+                self._command(frame[2], frame[3:-1], t)
+            else:
+                del self._buffer[0]
+                self._answer(FRAME_ERROR, b"", t)
+            self._buffer_since = t
+
+    def _answer(self, error: int, data: bytes, t: float) -> None:
+        self._wire.send(bytes([0xAA, 0x50 | len(data), error]) + data + b"\x85", t + ANSWER_S)
+
+    def _command(self, code: int, p: bytes, t: float) -> None:
+        if code not in COMMANDS:
+            return self._answer(UNKNOWN, b"", t)
+        count = COMMANDS[code]
+        if count is None:
+            return self._answer(NOT_IMPLEMENTED, b"", t)
+        if len(p) != count:
+            return self._answer(WRONG_COUNT, b"", t)
+        if code == 0x3B:  # GetValue: one measured frame is the answer
+            data, _ = self._frames(np.array([t]))
+            self._wire.send(data, t + ANSWER_S)
+            return None
+        if code == 0x78:
+            self._answer(OK, b"", t)
+            return self.reset(t)
+        return self._answer(*self._execute(code, p, t), t)
+
+    def _execute(self, code: int, p: bytes, t: float) -> tuple[int, bytes]:
+        match code:
+            case 0x23:
+                self._transmitting = False
+                return OK, b""
+            case 0x24:
+                if not self._transmitting:
+                    self._transmitting = True
+                    self._restart(t)
+                return OK, b""
+            case 0x8A:
+                return OK, struct.pack(">f", self._rate)
+            case 0x8B:
+                (rate,) = struct.unpack(">f", p)
+                if not math.isfinite(rate):
+                    return BAD_DATA, b""
+                if rate > MAX_RATE[self._type]:
+                    return TOO_BIG, b""
+                if rate < MIN_RATE:
+                    return TOO_SMALL, b""
+                self._rate = rate
+                self._restart(t)
+                return OK, b""
+            case 0x80:
+                words = {0: 0 if self._transmitting else 1, 1: self._type, 2: CHANNELS << 8 | 1}
+                return (OK, struct.pack(">H", words[p[0]])) if p[0] in words else (BAD_ADDRESS, b"")
+            case 0x81:
+                return self._set_tx_mode(p[0], int.from_bytes(p[1:], "big"), t)
+            case 0x1F:
+                return OK, struct.pack(">I", self._settings.serial_number)
+            case 0x2B:
+                return OK, struct.pack(">HH", 1, 44)
+            case 0x26:
+                return OK, struct.pack(">I", self._mode)
+            case 0x27:
+                (self._mode,) = struct.unpack(">I", p)
+                return OK, b""
+            case 0x0A:
+                return OK, b""
+        return self._channel_command(code, p, t)
+
+    def _set_tx_mode(self, index: int, word: int, t: float) -> tuple[int, bytes]:
+        if index == 0:
+            self._permanent = not word & 2
+            if word & 3:
+                self._transmitting = False
+            elif not self._transmitting:
+                self._transmitting = True
+                self._restart(t)
+            return OK, b""
+        if index != 1:
+            return BAD_ADDRESS, b""
+        if word not in TYPE_OF_WORD:
+            return BAD_DATA, b""
+        self._type = TYPE_OF_WORD[word]
+        if self._rate > MAX_RATE[self._type]:
+            self._rate = MAX_RATE[self._type]
+            self._restart(t)
+            return CHANGED, b""
+        return OK, b""
+
+    def _channel_command(self, code: int, p: bytes, t: float) -> tuple[int, bytes]:
+        """Commands whose first parameter is a channel, 1 to 8, or 0 for all where they write."""
+        writes = code in (0x03, 0x0C, 0x10, 0x15, 0x9B, 0xA3)
+        if not (1 <= p[0] <= CHANNELS or (writes and p[0] == 0)):
+            return BAD_ADDRESS, b""
+        channels = range(CHANNELS) if p[0] == 0 else [p[0] - 1]
+        one = channels[0]
+        if code in (0x03, 0x15, 0x9B):
+            (value,) = struct.unpack(">f", p[1:])
+            if not math.isfinite(value):
+                return BAD_DATA, b""
+            for channel in channels:
+                {0x03: self._zero, 0x15: self._user_scale, 0x9B: self._user_offset}[code][channel] = value
+            return OK, b""
+        match code:
+            case 0x02 | 0x14 | 0x9A:
+                table = {0x02: self._zero, 0x14: self._user_scale, 0x9A: self._user_offset}[code]
+                return OK, struct.pack(">f", table[one])
+            case 0x0C:
+                for channel in channels:
+                    self._zero[channel] = float(self._bridge(np.array([t]))[0]) if channel == self._cell else 0.0
+            case 0x0F:
+                return OK, bytes([self._unit[one]])
+            case 0x10:
+                for channel in channels:
+                    self._unit[channel] = p[1]
+            case 0x11:
+                return OK, {0: b"mV/V", 1: b"kg", 2: b"g", 3: b"N"}.get(self._unit[one], b"?").ljust(8, b"\0")
+            case 0xA2:
+                kind = self._input_type[one] if p[1] == 0xFF else p[1]
+                if kind > BRIDGE_2V5:
+                    return NOT_SUPPORTED, b""
+                return OK, bytes([kind]) + struct.pack(">I", round(100 * self.input_range(kind)))
+            case 0xA3:
+                if p[1] > BRIDGE_2V5:
+                    return NOT_SUPPORTED, b""
+                for channel in channels:
+                    self._input_type[channel] = p[1]
+        return OK, b""

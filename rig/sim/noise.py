@@ -1,0 +1,33 @@
+"""Noise that depends on the time of a conversion, never on who asks how often."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+class ConversionNoise:
+    """Standard normal noise of a converter that works through conversions of equal length.
+
+    Asking twice within one conversion gives the same number. Times must not decrease.
+    """
+
+    def __init__(self, rng: np.random.Generator, period: float, start: float = 0.0) -> None:
+        self._rng = rng
+        self._period = period
+        self._start = start
+        self._done = 0
+        self._value = 0.0
+
+    def restart(self, period: float, t: float) -> None:
+        """Go on with another conversion time from ``t`` on."""
+        self._period, self._start, self._done = period, t, 0
+
+    def at(self, t: float) -> float:
+        """The noise of the conversion that was complete at time ``t``."""
+        due = math.floor((t - self._start) / self._period) + 1
+        if due > self._done:
+            self._value = float(self._rng.standard_normal(due - self._done)[-1])
+            self._done = due
+        return self._value

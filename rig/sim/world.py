@@ -1,0 +1,199 @@
+"""The hidden truth of the simulated bench: where things are, what the film does, what is on the electrodes.
+
+Instruments move the two `Path` objects (stage and supply output) and read the rest. Times at which the world is
+asked must not lie before the last `advance`; the bench sees to that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from model.materials import Material
+from model.specimen import Specimen
+from rig.sim.film import FilmTable, Solve, solve_membrane, tabulate
+from rig.sim.path import Path
+from rig.sim.settings import SimulationSettings
+
+Floats = npt.NDArray[np.float64]
+
+TICK = 0.01  # s; the film's relaxation is integrated, and its strength checked, on this grid
+
+
+def true_specimen(settings: SimulationSettings, specimen: Specimen) -> Specimen:
+    """The specimen with the film that is really mounted."""
+    film, guess = settings.film, specimen.material
+    changes: dict[str, object] = {}
+    if film.mu_Pa is not None and film.alpha is not None:
+        changes |= {"mu": tuple(film.mu_Pa), "alpha": tuple(film.alpha)}
+    if film.eps_r is not None:
+        changes["eps_r"] = film.eps_r
+    if film.breakdown_field_MV_per_m is not None:
+        changes["breakdown_field"] = film.breakdown_field_MV_per_m * 1e6
+    if not changes:
+        return specimen
+    material: Material = replace(guess, **changes, name=f"{guess.name} as mounted")  # type: ignore[arg-type]
+    return specimen.with_material(material)
+
+
+class World:
+    r"""Stage, film and electrodes.
+
+    The film's force is its equilibrium force at displacement and voltage, plus overstress branches
+    (quasi-linear viscoelasticity, Fung 1972), each driven by the elastic force F_e at zero volts:
+
+    .. math:: \dot q_i = g_i \dot F_e - q_i/\tau_i
+
+    integrated exactly for F_e linear in time within a tick. Rig compliance acts on the equilibrium force.
+
+    Attributes
+    ----------
+    stage : Path
+        Carriage position as the lead screw means it (m).
+    output : Path
+        Voltage at the supply's terminals (V).
+    torn, broken_down : bool
+        The film was stretched beyond its reach; the film has arced and conducts from then on.
+    extra_leakage : float
+        Current drawn beside the film at any voltage (A), for faults.
+    """
+
+    def __init__(
+        self, settings: SimulationSettings, specimen: Specimen, has_hv: bool, solve: Solve = solve_membrane
+    ) -> None:
+        self.specimen = true_specimen(settings, specimen)
+        self._settings = settings
+        self._has_hv = has_hv
+        self._solve = solve
+        self._contact = settings.contact_position_mm * 1e-3
+        self._compliance = settings.rig_compliance_um_per_N * 1e-6
+        self._screw_error = settings.stage.screw_error_um * 1e-6
+        self._screw_wave = 2 * math.pi / (settings.stage.screw_pitch_mm * 1e-3)
+        self.stage = Path(settings.stage.start_position_mm * 1e-3)
+        self.output = Path(settings.hv.start_live_V if has_hv else 0.0)
+        self.torn = False
+        self.broken_down = False
+        self.extra_leakage = 0.0
+        self._table: FilmTable | None = None
+        self._branches = [(b.modulus_ratio, b.time_s) for b in settings.film.maxwell]
+        self._overstress = [0.0] * len(self._branches)
+        self._elastic = 0.0  # F_e at the last tick
+        self._tick = 0
+
+    @property
+    def film(self) -> FilmTable:
+        """The film's table, made when it is first needed."""
+        if self._table is None:
+            self._table = tabulate(self.specimen, self._compliance, self._has_hv, self._solve)
+        return self._table
+
+    def carriage(self, t: Floats) -> Floats:
+        """True position of the carriage (m) at the times ``t`` (n,), screw error included."""
+        x = self.stage.sample(t)
+        if self._screw_error:
+            x = x + self._screw_error * np.sin(self._screw_wave * x)
+        return x
+
+    def indentation(self, t: Floats) -> Floats:
+        """How far the carriage is beyond contact (m), never negative."""
+        return np.maximum(self.carriage(t) - self._contact, 0.0)
+
+    def voltage(self, t: Floats) -> Floats:
+        """Voltage on the electrodes (V)."""
+        return self.output.sample(t)
+
+    def _equilibrium(self, s: Floats, t: Floats) -> Floats:
+        s = np.minimum(s, self.film.reach)
+        return self.film.force(s, self.voltage(t) if self._has_hv else None)
+
+    def force(self, t: Floats) -> Floats:
+        """Force of the film on the pusher (N) at the times ``t`` (n,), none more than a tick after the last one."""
+        s = self.indentation(t)
+        if self.torn or not s.any():
+            force = np.zeros_like(s)
+        else:
+            force = self._equilibrium(s, t)
+        if self._branches and not self.torn:
+            start = self._tick * TICK
+            dt = np.maximum(t - start, 0.0)
+            rise = self._elastic_force(s) - self._elastic
+            for q, (ratio, tau) in zip(self._overstress, self._branches, strict=True):
+                force = force + _relax(q, ratio, tau, dt, rise)
+        return force
+
+    def displacement(self, t: Floats) -> Floats:
+        """Displacement of the disk from its flat position (m)."""
+        s = self.indentation(t)
+        if self.torn or not s.any():
+            return s
+        return s - self._compliance * self._equilibrium(s, t)
+
+    def _elastic_force(self, s: Floats) -> Floats:
+        if not s.any():
+            return np.zeros_like(s)
+        return self.film.force(np.minimum(s, self.film.reach))
+
+    @property
+    def film_resistance(self) -> float:
+        """Resistance between the electrodes (ohm)."""
+        hv = self._settings.hv
+        return hv.arc_resistance_kOhm * 1e3 if self.broken_down else hv.leakage_resistance_GOhm * 1e9
+
+    def current(self, t: float) -> float:
+        """Current out of the supply (A): charging, leakage, and what a fault adds."""
+        voltage, slope = self.output.at(t)
+        extra = self.extra_leakage if voltage > 0 else 0.0
+        return self._settings.hv.film_capacitance_nF * 1e-9 * slope + voltage / self.film_resistance + extra
+
+    @property
+    def next_time(self) -> float:
+        """The next tick, inf while nothing can change."""
+        if self._branches or self._tick * TICK < max(self.stage.end, self.output.end):
+            return (self._tick + 1) * TICK
+        return math.inf
+
+    def advance(self, t: float) -> None:
+        """Let the ticks up to ``t`` happen."""
+        if self._branches:
+            while (self._tick + 1) * TICK <= t:
+                self._one_tick((self._tick + 1) * TICK)
+                self._tick += 1
+        else:
+            tick = math.floor(t / TICK + 1e-9)
+            if tick > self._tick:
+                self._tick = tick
+                self._check_strength(t)
+
+    def _one_tick(self, t: float) -> None:
+        time = np.array([t])
+        elastic = float(self._elastic_force(self.indentation(time))[0])
+        rise = np.array([elastic - self._elastic])
+        dt = np.array([TICK])
+        self._overstress = [
+            float(_relax(q, ratio, tau, dt, rise)[0])
+            for q, (ratio, tau) in zip(self._overstress, self._branches, strict=True)
+        ]
+        self._elastic = elastic
+        self._check_strength(t)
+
+    def _check_strength(self, t: float) -> None:
+        time = np.array([t])
+        s = self.indentation(time)
+        if s[0] > 0 and s[0] > self.film.reach:
+            self.torn = True
+        if self._has_hv and not self.broken_down:
+            voltage = self.voltage(time)
+            if voltage[0] > 0:
+                self.broken_down = bool(voltage[0] >= self.film.breakdown_voltage(np.minimum(s, self.film.reach))[0])
+
+
+def _relax(q: float, ratio: float, tau: float, dt: Floats, rise: Floats) -> Floats:
+    """Overstress after ``dt`` of an elastic force that rises by ``rise`` at a constant rate."""
+    fraction = dt / tau
+    # (1 - exp(-x))/x, 1 at x = 0
+    mean = np.where(fraction > 0, -np.expm1(-fraction) / np.where(fraction > 0, fraction, 1.0), 1.0)
+    overstress: Floats = q * np.exp(-fraction) + ratio * rise * mean
+    return overstress
