@@ -51,6 +51,11 @@ SAMPLING_US = (20, 50, 100, 200, 500, 1000)
 AVERAGING = tuple(4**n for n in range(10))
 """Number of samples averaged by the code of ``SW,OC``."""
 
+LONGEST_SETTLING_S = 10.0
+"""How long set-up waits for the first value; a specimen that the head cannot see never gives one."""
+
+SETTLING_LOOK_S = 0.01
+
 _MEASURE = "value"
 _MAX_LINE = 128
 _SPECIAL = {
@@ -299,7 +304,7 @@ class KeyenceLKG:
 
     def _implausible(self, message: Measured) -> bool:
         value = message.values.get(self._output)
-        return value is None or abs(value.number) > self._limit
+        return value is not None and abs(value.number) > self._limit
 
     def _send(self, request: str) -> Callable[[Message], bool]:
         if request == _MEASURE:
@@ -312,10 +317,11 @@ class KeyenceLKG:
         return lambda message: _answers(command, message)
 
     def _set_up(self) -> Script[str, Message]:
-        yield from self._enter("Q0")
         self._communicating = True
+        yield from self._enter("Q0")
         sampling = yield from self._setting("SR,CA")
-        averaging = yield from self._setting(f"SR,OC,{self._output}")
+        # Whether the kind of filter (0: average) belongs to the question is not known for every firmware.
+        averaging = yield from self._setting(f"SR,OC,{self._output}", f"SR,OC,{self._output},0")
         yield from self._enter("R0")
         self._communicating = False
         program = yield from self._setting("PR")
@@ -332,6 +338,10 @@ class KeyenceLKG:
             "averaging_window_ms": f"{self.averaging_window_s * 1e3:g}",
             "program": program,
         }
+        # After communication mode the average begins anew; until it is full there is no value to show.
+        give_up = self._now + LONGEST_SETTLING_S
+        while self._now < give_up and (yield from self._value(delay_s=SETTLING_LOOK_S))[1].flag & SampleFlag.NO_VALUE:
+            pass
         self._schedule.start(self._now)
         self._ready = True
 
@@ -341,27 +351,32 @@ class KeyenceLKG:
         if isinstance(message, Refused) and message.code != 1:
             self._refuse(mode, message)
 
-    def _setting(self, request: str) -> _Part[str]:
-        """Last parameter of the answer. A refusal is written down: measuring does not depend on it."""
-        message = (yield Ask(request)).message
-        if isinstance(message, Refused):
-            return f"refused: {ERRORS.get(message.code, ('error', ''))[0]} ({message.code:02d})"
-        assert isinstance(message, Response)
-        return message.text.rpartition(",")[2]
+    def _setting(self, *requests: str) -> _Part[str]:
+        """Last parameter of the first answer. A refusal is written down: measuring does not depend on it."""
+        refused = ""
+        for request in requests:
+            message = (yield Ask(request)).message
+            if isinstance(message, Response):
+                return message.text.rpartition(",")[2]
+            assert isinstance(message, Refused)
+            refused = f"refused: {ERRORS.get(message.code, ('error', ''))[0]} ({message.code:02d})"
+        return refused
 
     def _measure(self) -> Script[str, Message]:
-        answer = yield Ask(_MEASURE)
-        message = answer.message
-        if isinstance(message, Refused) and message.code == 1:
+        t, value = yield from self._value()
+        self._samples.append(DisplacementSample(t, value.number * self._unit, value.flag))
+
+    def _value(self, delay_s: float = 0.0) -> _Part[tuple[float, Value]]:
+        """One value of our OUT, with its time."""
+        answer = yield Ask(_MEASURE, delay_s=delay_s)
+        if isinstance(answer.message, Refused) and answer.message.code == 1:
             self.counters["mode_restored"] += 1
             yield from self._enter("R0")
             answer = yield Ask(_MEASURE)
-            message = answer.message
-        if isinstance(message, Refused):
-            self._refuse("to measure", message)
-        assert isinstance(message, Measured)
-        value = message.values[self._output]
-        self._samples.append(DisplacementSample(answer.t, value.number * self._unit, value.flag))
+        if isinstance(answer.message, Refused):
+            self._refuse("to measure", answer.message)
+        assert isinstance(answer.message, Measured)
+        return answer.t, answer.message.values[self._output]
 
     def _refuse(self, command: str, refused: Refused) -> NoReturn:
         why, advice = ERRORS.get(refused.code, ("of an error that this driver does not know", ""))

@@ -276,6 +276,29 @@ def test_settings_that_cannot_be_read_do_not_keep_it_from_measuring(bench: Bench
     assert bench.sensor.settings["averaging_window_ms"] == "nan"
 
 
+def test_other_form_of_the_question_for_averaging(bench: Bench) -> None:
+    del bench.fake.answers["SR,OC,1"]
+    bench.fake.answers["SR,OC,1,0"] = "SR,OC,1,0,6"
+    bench.run(0.05)
+    assert bench.sensor.settings["averaging_samples"] == "4096"
+
+
+def test_set_up_waits_until_the_average_is_full_again(bench: Bench) -> None:
+    bench.fake.out1 = "XXXXXXXX"
+    bench.run(0.8)
+    assert not bench.sensor.ready
+    bench.fake.out1 = "+01.2345"
+    bench.run(0.1)
+    assert bench.sensor.ready and not any(s.flags for s in bench.samples)
+
+
+@pytest.mark.parametrize(("shown", "after"), [("XXXXXXXX", 10.1), ("+FFFFFFF", 0.1)])
+def test_specimen_that_cannot_be_seen_does_not_hold_up_set_up(bench: Bench, shown: str, after: float) -> None:
+    bench.fake.out1 = shown
+    bench.run(after)
+    assert bench.sensor.ready
+
+
 def test_values_come_at_the_rate_in_metres_with_midpoint_times(measuring: Bench) -> None:
     measuring.run(1.0)
     assert 99 <= len(measuring.samples) <= 101
@@ -401,7 +424,6 @@ def test_lost_port_leaves_poll(measuring: Bench) -> None:
 def test_close_in_communication_mode_leaves_it(fake: FakeLKG) -> None:
     sensor = KeyenceLKG("laser", fake)
     sensor.poll(0.0)
-    sensor.poll(0.001)
     assert fake.communicating
     sensor.close()
     sensor.close()
