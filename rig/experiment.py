@@ -86,6 +86,7 @@ def run(experiment: Experiment, out: Path, progress: Callable[[float, float, str
             _attach(log, experiment, problems)
             engine = Engine(bench, experiment.actions, log, _gains(experiment.certificates), stop, progress)
             outcome, error = engine.run()
+            bench.close()  # before the log ends: closing a device may say a last word on its wire
             if not engine.recorder.log_failed:
                 log.finish(outcome.as_text())
     finally:

@@ -32,10 +32,7 @@ class Gains:
 class Recorder:
     """Turns samples into quantities, keeps the newest of each, and writes the log.
 
-    Attributes
-    ----------
-    force, displacement : float
-        Newest force (N) and displacement of the film (m); NaN until their references are known.
+    ``force`` and ``displacement`` are NaN until their references are known.
     """
 
     def __init__(self, log: LogWriter, clock: Clock, gains: Gains) -> None:
@@ -49,9 +46,13 @@ class Recorder:
         self.force_zero = math.nan
         self.displacement_zero = math.nan
         self.contact = math.nan
-        self.force = math.nan
         self.has_laser = False
         self.log_failed = False
+
+    @property
+    def force(self) -> float:
+        """Newest force on the film (N)."""
+        return math.nan if self.force_sample is None else self.quantity_of(self.force_sample)
 
     @property
     def displacement(self) -> float:
@@ -73,12 +74,11 @@ class Recorder:
         match sample:
             case ForceSample():
                 self.force_sample = sample
-                self.force = self.quantity_of(sample)
                 self._write(
                     "/force/sample",
                     sample.t,
                     reading_mV_per_V=sample.reading,
-                    force_N=self.force,
+                    force_N=self.quantity_of(sample),
                     flags=sample.flags.value,
                 )
             case StageSample():

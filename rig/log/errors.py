@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rig.errors import RigError
 
-class LogError(Exception):
+
+class LogError(RigError):
     """A log that cannot be written or read.
 
     Parameters
