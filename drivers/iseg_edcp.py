@@ -358,7 +358,7 @@ class IsegEDCP:
 
     A command writes and reads back; a write that got lost is repeated, except switching on. A command that fails
     raises from ``poll`` and takes the commands queued behind it with it. ``emergency_off`` drops whatever is queued or
-    under way and is sent by the next poll, answered or not.
+    under way and is sent by the next poll, answered or not; if it is not confirmed, all modules on the bus are told.
 
     Parameters
     ----------
@@ -766,9 +766,10 @@ class IsegEDCP:
         try:
             yield from self._write_checked(CHANNEL_CONTROL, int(ChannelControl.EMERGENCY_OFF), self._channel)
         except DeviceError as error:
+            self._link.write(EMERGENCY_OFF_ALL)
             raise type(error)(
                 self.name,
-                f"EMERGENCY OFF IS NOT CONFIRMED ({error.what})",
+                f"EMERGENCY OFF IS NOT CONFIRMED ({error.what}); it was sent to all modules on the bus as well",
                 "Take the high voltage away by hand: safety loop or mains switch, then ground the electrodes.",
             ) from error
 

@@ -495,6 +495,7 @@ def test_emergency_off_is_sent_to_a_module_that_never_answers() -> None:
     with pytest.raises(DeviceSilent, match="EMERGENCY OFF IS NOT CONFIRMED"):
         rig.run(2.0)
     assert rig.writes.count(frame("200# 40 01 00 00 20")) == 3
+    assert rig.writes.index(edcp.EMERGENCY_OFF_ALL) > 3  # the last resort
 
 
 def test_emergency_off_that_does_not_take_is_said_loudly() -> None:
