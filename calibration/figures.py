@@ -1,0 +1,248 @@
+"""Figures of the report, as SVG text: readable on paper and without colour vision."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.curve import Curve
+from calibration.identify import secant_modulus
+from calibration.reduction import Selection, reference_voltage
+from calibration.result import Identification
+from model.materials import Material
+from model.membrane import solve_many
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+
+# Okabe & Ito's colours that can be told apart with any colour vision, and a marker and a dash for black and white.
+STYLES = (
+    ("#0072B2", "o", "-"),
+    ("#D55E00", "s", "--"),
+    ("#009E73", "^", "-."),
+    ("#CC79A7", "D", ":"),
+    ("#E69F00", "v", (0, (5, 1, 1, 1, 1, 1))),
+    ("#56B4E9", "P", (0, (1, 1))),
+)
+BINS = 24
+RC: Any = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "svg.hashsalt": "dea-rig",
+    "savefig.dpi": 200,
+}
+
+
+def by_specimen(curves: Sequence[Curve]) -> dict[str, list[int]]:
+    """Indexes of the curves of every specimen, by a title that says which it is."""
+    groups: dict[str, list[int]] = {}
+    for index, curve in enumerate(curves):
+        s = curve.specimen
+        title = (
+            f"{s.name + ': ' if s.name else ''}a = {s.disk_radius * 1e3:g} mm, b = {s.ring_radius * 1e3:g} mm, "
+            f"T = {s.thickness * 1e6:g} µm, λp = {s.prestretch:g}"
+        )
+        groups.setdefault(title, []).append(index)
+    return groups
+
+
+def model_force(identification: Identification, curve: Curve, h: Array, voltage: float) -> Array:
+    """Force (N) that the identified film gives at measured displacements ``h``, zeros of the run included."""
+    zeros = {name: zero.value for name, zero in identification.nuisance.items()}
+    shift = zeros.get(f"displacement zero of {curve.run}", 0.0)
+    offset = zeros.get(f"force zero of {curve.run}", 0.0)
+    force: Array = solve_many(curve.specimen.with_material(identification.material), h + shift, voltage).force
+    return force + offset
+
+
+def force_displacement(identification: Identification, curves: Sequence[Curve], selections: Sequence[Selection]) -> str:
+    """The paper's figure 4: one panel a specimen, measured and modelled force at every voltage."""
+    groups = by_specimen(curves)
+    styles = _styles(curves)
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
+        for number, (ax, (title, members)) in enumerate(zip(axes, groups.items(), strict=True)):
+            drawn = set()
+            for index in members:
+                curve, selection = curves[index], selections[index]
+                colour, marker, dash = styles[abs(curve.nominal_voltage)]
+                _samples(ax, curve.h, curve.force, selection.used, colour, scale=1.0)
+                for direction, fill in ((1, colour), (0, colour), (-1, "white")):
+                    rows = selection.used & (curve.direction == direction)
+                    h, force, _ = _binned(curve.h[rows], curve.force[rows])
+                    ax.plot(h * 1e3, force, marker, ms=4, mfc=fill, mec=colour, mew=0.9, ls="none", zorder=3)
+                key = (curve.run, curve.nominal_voltage)
+                if key not in drawn and selection.used.any():
+                    drawn.add(key)
+                    grid = np.linspace(selection.low, selection.high, 120)
+                    force = model_force(identification, curve, grid, reference_voltage(curve, selection.used))
+                    ax.plot(grid * 1e3, force, color=colour, ls=dash, lw=1.6, zorder=4)
+            ax.set_title(f"({chr(97 + number)}) {title}")
+            ax.set_xlabel("displacement h / mm")
+        axes[0].set_ylabel("force F / N")
+        axes[0].legend(handles=_legend(styles), loc="upper left")
+
+    return _svg(draw, width=4.2 * len(groups) if len(groups) > 1 else 5.4, height=3.7)
+
+
+def residuals(identification: Identification, curves: Sequence[Curve], selections: Sequence[Selection]) -> str:
+    """Measured minus modelled force against displacement, one panel a specimen and voltage."""
+    groups = by_specimen(curves)
+    voltages = sorted({abs(curve.nominal_voltage) for curve in curves})
+    styles = _styles(curves)
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots(len(voltages), len(groups), sharex="col", sharey=True, squeeze=False)
+        for column, members in enumerate(groups.values()):
+            for row, voltage in enumerate(voltages):
+                ax = axes[row, column]
+                for index in members:
+                    if abs(curves[index].nominal_voltage) == voltage and selections[index].used.any():
+                        _residual_panel(ax, identification, curves[index], selections[index], styles[voltage])
+                ax.axhline(0.0, color="black", lw=0.8, zorder=2)
+                ax.set_title(f"{list(groups)[column].split(',')[0]}, {voltage:g} V")
+        for ax in axes[-1]:
+            ax.set_xlabel("displacement h / mm")
+        for ax in axes[:, 0]:
+            ax.set_ylabel("residual / mN")
+        figure.align_ylabels()
+
+    return _svg(draw, width=4.2 * max(len(groups), 1.3), height=0.7 + 1.75 * len(voltages))
+
+
+def stiffness(identification: Identification, truth: Material | None) -> str:
+    """Secant shear modulus against stretch with its 95 % band, and where the data determine it best."""
+    curve = identification.stiffness_curve
+    stretch = np.array(curve.meridional_stretch)
+    value, deviation = np.array(curve.secant_modulus) * 1e-3, np.array(curve.uncertainty) * 1e-3
+    at = identification.stretch[0]
+    best = identification.quantities["stiffness"]
+
+    def draw(figure: Any) -> None:
+        ax = figure.subplots()
+        ax.fill_between(stretch, value - 1.96 * deviation, value + 1.96 * deviation, color="#56B4E9", alpha=0.35, lw=0)
+        ax.plot(stretch, value, color="#0072B2", lw=1.6)
+        handles = [_line(color="#0072B2", lw=1.6, label="identified"), _patch("#56B4E9", "95 % interval")]
+        if truth is not None:
+            hidden = [secant_modulus(truth, float(s), curve.hoop_stretch) * 1e-3 for s in stretch]
+            ax.plot(stretch, hidden, color="black", lw=1.2, ls="--")
+            handles.append(_line(color="black", lw=1.2, ls="--", label="truth of the simulation"))
+        ax.errorbar(at, best.value * 1e-3, 1.96e-3 * best.uncertainty, fmt="o", color="#D55E00", ms=5, capsize=3)
+        handles.append(_line(color="#D55E00", marker="o", ls="none", ms=5, label=f"best determined, at {at:.2f}"))
+        low, high = ax.get_ylim()
+        ax.set_ylim(max(low, 0.0), min(high, 2.0 * value.max()))
+        ax.set_xlabel(f"meridional stretch $\\lambda_1$ (hoop stretch {curve.hoop_stretch:.3g})")
+        ax.set_ylabel("secant shear modulus / kPa")
+        ax.legend(handles=handles, loc="upper left")
+
+    return _svg(draw, width=5.4, height=3.3)
+
+
+def _styles(curves: Sequence[Curve]) -> dict[float, tuple[str, str, Any]]:
+    voltages = sorted({abs(curve.nominal_voltage) for curve in curves})
+    return {voltage: STYLES[k % len(STYLES)] for k, voltage in enumerate(voltages)}
+
+
+def _samples(ax: Axes, h: Array, y: Array, used: NDArray[np.bool_], colour: str, scale: float) -> None:
+    """Single samples, faint and as pixels; those left out as grey crosses."""
+    ax.plot(h[used] * 1e3, y[used] * scale, ",", color=colour, alpha=0.25, zorder=1, rasterized=True)
+    ax.plot(h[~used] * 1e3, y[~used] * scale, "x", color="#999999", ms=3, mew=0.6, zorder=1, rasterized=True)
+
+
+def _binned(h: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Means of ``h`` and ``y`` in bins of equal width, and the standard error of the latter."""
+    if h.size == 0:
+        return h, y, y
+    edges = np.linspace(h.min(), np.nextafter(h.max(), np.inf), BINS + 1)
+    which = np.clip(np.searchsorted(edges, h, side="right") - 1, 0, BINS - 1)
+    count = np.bincount(which, minlength=BINS)
+    filled = count > 0
+    mean_h = np.bincount(which, h, BINS)[filled] / count[filled]
+    mean_y = np.bincount(which, y, BINS)[filled] / count[filled]
+    square = np.bincount(which, y**2, BINS)[filled] / count[filled]
+    error = np.sqrt(np.maximum(square - mean_y**2, 0.0) / np.maximum(count[filled] - 1, 1))
+    return mean_h, mean_y, error
+
+
+def _residual_panel(
+    ax: Axes, identification: Identification, curve: Curve, selection: Selection, style: tuple[str, str, Any]
+) -> None:
+    colour, marker, _ = style
+    used = selection.used
+    h = curve.h[used]
+    grid = np.linspace(selection.low, selection.high, 200)
+    force = model_force(identification, curve, grid, reference_voltage(curve, used))
+    residual = (curve.force[used] - np.interp(h, grid, force)) * 1e3
+    _samples(ax, h, residual, np.ones(h.size, dtype=np.bool_), colour, scale=1.0)
+    for direction, fill, shift in ((1, colour, -0.004), (0, colour, 0.0), (-1, "white", 0.004)):
+        rows = curve.direction[used] == direction
+        mean_h, mean, error = _binned(h[rows], residual[rows])
+        if mean_h.size:
+            place = mean_h * 1e3 + shift * (selection.high - selection.low) * 1e3  # side by side, not on top
+            ax.errorbar(
+                place,
+                mean,
+                2 * error,
+                fmt=marker,
+                ms=3.5,
+                mfc=fill,
+                mec=colour,
+                ecolor=colour,
+                elinewidth=0.9,
+                zorder=3,
+            )
+    noise = 2e3 * curve.force_noise
+    ax.fill_between(grid * 1e3, -noise, noise, color="#000000", alpha=0.05, lw=0, zorder=0)
+
+
+def _legend(styles: dict[float, tuple[str, str, Any]]) -> list[Any]:
+    handles = [
+        _line(color=colour, marker=marker, ls=dash, ms=4, lw=1.6, label=f"{voltage:g} V")
+        for voltage, (colour, marker, dash) in styles.items()
+    ]
+    handles.append(_line(color="#555555", marker="o", ls="none", ms=4, label="measured, loading (mean)"))
+    handles.append(_line(color="#555555", marker="o", mfc="white", ls="none", ms=4, label="measured, unloading (mean)"))
+    handles.append(_line(color="#555555", lw=1.6, label="model"))
+    handles.append(_line(color="#999999", marker="x", ls="none", ms=4, label="left out"))
+    return handles
+
+
+def _line(**style: Any) -> Any:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], **style)
+
+
+def _patch(colour: str, label: str) -> Any:
+    from matplotlib.patches import Patch
+
+    return Patch(color=colour, alpha=0.35, lw=0, label=label)
+
+
+def _svg(draw: Any, *, width: float, height: float) -> str:
+    """Make a figure of the given size (inches), and return it as SVG text that is the same each time."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        draw(figure)
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    return text.getvalue()
