@@ -7,13 +7,14 @@ instruments and checks the limits between two turns. An action that takes much l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.roles import HVFlag
+from drivers.roles import DisplacementSample, ForceSample, HVFlag, Sample, StageSample
 from rig.errors import FaultError, LimitError
 from rig.plan import Action
 from rig.safety.guard import check_path
@@ -50,6 +51,16 @@ def _pause(engine: Engine, duration: float) -> Turns:
         yield
 
 
+@contextmanager
+def _listening(engine: Engine, listener: Callable[[Sample], None]) -> Iterator[None]:
+    """Within this context every sample is told to ``listener`` as it arrives."""
+    engine.listener = listener
+    try:
+        yield
+    finally:
+        engine.listener = None
+
+
 def _patience(action: Action) -> float:
     return action.duration * PATIENCE + GRACE_S
 
@@ -68,12 +79,15 @@ def _zero(engine: Engine, action: Action) -> Turns:
     recorder = engine.recorder
     force: list[float] = []
     laser: list[float] = []
-    engine.force_listener = lambda sample, _: force.append(sample.reading)
-    engine.displacement_listener = lambda sample: laser.append(sample.displacement)
-    try:
+
+    def listen(sample: Sample) -> None:
+        if isinstance(sample, ForceSample):
+            force.append(sample.reading)
+        elif isinstance(sample, DisplacementSample):
+            laser.append(sample.displacement)
+
+    with _listening(engine, listen):
         yield from _pause(engine, action.parameters["duration"])
-    finally:
-        engine.force_listener = engine.displacement_listener = None
     recorder.force_zero, error = _mean(force, "force")
     engine.force_noise = error * math.sqrt(len(force)) * engine.gains.force
     recorder.reference("force_zero", recorder.force_zero, error, "mV/V")
@@ -95,7 +109,7 @@ def _approach(engine: Engine, action: Action) -> Turns:
     """Advance until the averaged force exceeds the threshold; then work out where it began to rise.
 
     With a laser the contact position is where the laser says zero. Without, it is the corner of the line
-    ``max(0, k (x - x0))`` through the forces met on the way.
+    ``max(0, k (x - x0))`` through the forces met on the way, each at the stage's position at its own time.
     """
     recorder, stage = engine.recorder, engine.bench.stage
     threshold = action.parameters["threshold"]
@@ -110,33 +124,34 @@ def _approach(engine: Engine, action: Action) -> Turns:
     engine.move_stage(start, action.parameters["fast"])
     yield from _wait(engine, lambda: not stage.moving, _patience(action), "The stage's way to where approaching begins")
     goal = min(start + action.parameters["max_travel"], stage.travel[1])
-    positions: list[float] = []
-    forces: list[float] = []
+    way: list[tuple[float, float]] = []  # time and position of the stage
+    met: list[tuple[float, float]] = []  # time and force
 
-    def listen(_: object, force: float) -> None:
-        assert recorder.stage is not None
-        positions.append(recorder.stage.position)
-        forces.append(force)
+    def listen(sample: Sample) -> None:
+        if isinstance(sample, StageSample):
+            way.append((sample.t, sample.position))
+        elif isinstance(sample, ForceSample):
+            met.append((sample.t, recorder.quantity_of(sample)))
 
-    engine.force_listener = listen
-    try:
-        engine.move_stage(goal, action.speed)
-        end = engine.clock.now() + _patience(action)
-        while not (len(forces) >= n and float(np.mean(forces[-n:])) > threshold):
-            if not stage.moving or engine.clock.now() > end:
-                raise FaultError(
-                    f"The film was not met within {action.parameters['max_travel'] * 1e3:g} mm of travel. "
-                    "Is the specimen mounted, and the force sensor connected?"
-                )
-            yield
-    finally:
-        engine.force_listener = None
-        engine.stop_stage()
+    with _listening(engine, listen):
+        try:
+            engine.move_stage(goal, action.speed)
+            end = engine.clock.now() + _patience(action)
+            while not (len(met) >= n and np.mean([force for _, force in met[-n:]]) > threshold):
+                if not stage.moving or engine.clock.now() > end:
+                    raise FaultError(
+                        f"The film was not met within {action.parameters['max_travel'] * 1e3:g} mm of travel. "
+                        "Is the specimen mounted, and the force sensor connected?"
+                    )
+                yield
+        finally:
+            engine.stop_stage()
     yield from _wait(engine, lambda: not stage.moving, GRACE_S, "The stage's standstill")
     if recorder.has_laser:
         recorder.contact, error = yield from _contact_by_laser(engine)
     else:
-        recorder.contact, error = _corner(np.array(positions), np.array(forces))
+        times, forces = np.array(met).T
+        recorder.contact, error = _corner(np.interp(times, *np.array(way).T), forces)
     recorder.reference("contact_position", recorder.contact, error, "m")
     engine.move_to(0.0, action.speed, 0.0)
     yield from _wait(engine, lambda: not stage.moving, GRACE_S, "The return to the contact position")
@@ -146,11 +161,13 @@ def _contact_by_laser(engine: Engine) -> Generator[None, None, tuple[float, floa
     """Stage position minus laser displacement at a standstill, and its standard error."""
     laser: list[float] = []
     recorder = engine.recorder
-    engine.displacement_listener = lambda sample: laser.append(recorder.quantity_of(sample))
-    try:
+
+    def listen(sample: Sample) -> None:
+        if isinstance(sample, DisplacementSample):
+            laser.append(recorder.quantity_of(sample))
+
+    with _listening(engine, listen):
         yield from _pause(engine, 0.5)
-    finally:
-        engine.displacement_listener = None
     displacement, error = _mean(laser, "displacement")
     assert recorder.stage is not None
     return recorder.stage.position - displacement, error

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from drivers.link import DeviceError
-from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample
+from drivers.roles import HVSample, Sample
 from rig.actions import carry_out, film_checked
 from rig.bench import Bench
 from rig.errors import ConfigError, FaultError, LimitError, RigError, Stopped
@@ -25,7 +25,7 @@ from rig.signals import StopRequest
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
 
-TURN_S = 0.005  # the loop comes round at least this often
+SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
 SETUP_LIMIT_S = 15.0
 SILENCE_PERIODS = 10.0  # a sensor silent for this many of its periods, and at least SILENCE_S, is a fault
 SILENCE_S = 0.5
@@ -105,8 +105,7 @@ class Engine:
         self.limits = Limits.of(bench.scene)
         self.film = FilmLimits(bench.scene.specimen.specimen(), self.limits)
         self.force_noise = math.nan
-        self.force_listener: Callable[[ForceSample, float], None] | None = None
-        self.displacement_listener: Callable[[DisplacementSample], None] | None = None
+        self.listener: Callable[[Sample], None] | None = None
         self._actions = actions
         self._stop = stop
         self._progress = progress
@@ -114,6 +113,7 @@ class Engine:
         self._nominal_voltage = 0.0
         self._started = self.clock.now()
         self._last_sample: dict[str, float] = {}
+        self._silence: dict[str, float] = {}
         self._next_film_check = 0.0
         self._next_progress = 0.0
         self._watching = False
@@ -203,8 +203,8 @@ class Engine:
                     f"{role}: the scene names serial number {table.serial}, but {found.serial or 'no serial number'} "
                     "answered. Are two instruments swapped? Nothing was moved and no output changed."
                 )
-        for role in self.bench.devices:
-            self._last_sample[role] = self.clock.now()
+        self._last_sample = dict.fromkeys(self.bench.devices, self.clock.now())
+        self._silence = self._allowed_silence()
 
     def _carry_out_all(self) -> None:
         total = sum(action.duration for action in self._actions)
@@ -248,26 +248,22 @@ class Engine:
 
     def _next_turn(self, now: float) -> float:
         wanted = min(device.next_poll for device in self.bench.devices.values())
-        return min(max(wanted, now + 0.001), now + TURN_S)
+        return min(max(wanted, now + SHORTEST_TURN_S), now + LONGEST_TURN_S)
 
     def _take(self, role: str, sample: Sample, now: float) -> None:
         self.recorder.add(sample)
         self._last_sample[role] = now
-        if isinstance(sample, ForceSample):
-            if self.force_listener is not None:
-                self.force_listener(sample, self.recorder.force)
-        elif isinstance(sample, DisplacementSample):
-            if self.displacement_listener is not None:
-                self.displacement_listener(sample)
-        elif isinstance(sample, HVSample) and self._guard is not None:
+        if self.listener is not None:
+            self.listener(sample)
+        if isinstance(sample, HVSample) and self._guard is not None:
             self._guard.on_sample(sample)
 
     def _watch(self, now: float) -> None:
         """Hold what was measured against the limits, and the age of every sensor against its rate."""
         recorder = self.recorder
-        for role, period in self._periods().items():
+        for role, allowed in self._silence.items():
             age = now - self._last_sample[role]
-            if not age <= max(SILENCE_S, SILENCE_PERIODS * period):
+            if not age <= allowed:
                 raise FaultError(f"{role}: no sample for {age:.2f} s. Motion was stopped and the voltage taken down.")
         if math.isfinite(recorder.force_zero):
             self.limits.force.check(recorder.force, "Force measured")
@@ -279,14 +275,15 @@ class Engine:
                 voltage = recorder.hv.voltage if recorder.hv is not None else math.nan
                 self.film.check(recorder.displacement, max(voltage, 0.0), "Film, as measured")
 
-    def _periods(self) -> dict[str, float]:
+    def _allowed_silence(self) -> dict[str, float]:
+        """Seconds without a sample after which a device counts as silent."""
         bench = self.bench
-        periods = {"stage": 1 / bench.scene.stage.poll_rate_Hz, "force": 1 / bench.force.rate}
+        rates = {"stage": bench.scene.stage.poll_rate_Hz, "force": bench.force.rate}
         if bench.displacement is not None:
-            periods["displacement"] = 1 / bench.displacement.rate
+            rates["displacement"] = bench.displacement.rate
         if bench.scene.hv is not None:
-            periods["hv"] = 1 / bench.scene.hv.poll_rate_Hz
-        return periods
+            rates["hv"] = bench.scene.hv.poll_rate_Hz
+        return {role: max(SILENCE_S, SILENCE_PERIODS / rate) for role, rate in rates.items()}
 
     # The end -------------------------------------------------------------------------------------------------
 

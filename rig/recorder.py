@@ -7,8 +7,7 @@ references taken during the run, and each is written with its raw reading beside
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -145,21 +144,21 @@ class Recorder:
 
     def tick(self, now: float) -> None:
         """Let the log send what is due to its file."""
-        if not self.log_failed:
-            with self._failing_once():
-                self._log.tick(now)
+        if self.log_failed:
+            return
+        try:
+            self._log.tick(now)
+        except LogError:
+            self.log_failed = True
+            raise
 
     def _write(self, topic: str, t: float, **fields: object) -> None:
-        if not self.log_failed:
-            epoch_ns = self._clock.epoch_ns
-            with self._failing_once():
-                self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), epoch_ns(t))
-
-    @contextmanager
-    def _failing_once(self) -> Iterator[None]:
         """The first error of the log ends the run; after it the way to the safe state goes on unrecorded."""
+        if self.log_failed:
+            return
+        epoch_ns = self._clock.epoch_ns
         try:
-            yield
+            self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), epoch_ns(t))
         except LogError:
             self.log_failed = True
             raise
