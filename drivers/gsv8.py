@@ -340,7 +340,6 @@ class GSV8:
         self._limit = _UNKNOWN_RANGE_LIMIT
         self._clock: SampleClock[ForceSample | None] | None = None
         self._heard = 0.0
-        self._windows_off_rate = 0
         self._polls = 0
         self._next_poll = -math.inf
 
@@ -414,7 +413,6 @@ class GSV8:
         if clock is None:
             return []
         self._heard = min(self._heard, now)
-        windows = clock.windows
         samples = [ForceSample(t, s.reading, s.flags) for t, s in clock.feed(now, arrived) if s is not None]
         if any(s is not None for s in arrived):
             self._heard = now
@@ -425,15 +423,12 @@ class GSV8:
                 f"no valid measured value for {silent_s:.2f} s though the stream was started",
                 "Check the amplifier and its cable; it may have been switched off or reset.",
             )
-        if clock.windows != windows:
-            self._windows_off_rate = 0 if 0.5 <= clock.rate_ratio <= 1.05 else self._windows_off_rate + 1
-            if self._windows_off_rate == 2:  # one window may hold what a stall had dammed up
-                self._windows_off_rate = 0
-                raise DeviceRefused(
-                    self.name,
-                    f"streams at {clock.rate_ratio * self._rate:.4g} Hz although {self._rate:.4g} Hz were set",
-                    "The amplifier may have been reset, or the line loses data.",
-                )
+        if clock.off_rate:
+            raise DeviceRefused(
+                self.name,
+                f"streams at {clock.rate_ratio * self._rate:.4g} Hz although {self._rate:.4g} Hz were set",
+                "The amplifier may have been reset, or the line loses data.",
+            )
         return samples
 
     # -- dialogue ---------------------------------------------------------------------------------------------------

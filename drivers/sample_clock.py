@@ -76,11 +76,17 @@ class SampleClock(Generic[T]):
         """Samples of the last complete window over those that the nominal rate would have given."""
         self.windows = 0
         """Number of complete windows."""
+        self._windows_off_rate = 0
 
     @property
     def drift(self) -> float:
         """Relative deviation of the instrument's period from its nominal one, against the host's clock."""
         return self._period / self._nominal - 1.0
+
+    @property
+    def off_rate(self) -> bool:
+        """True after two windows in a row at quite another rate; one alone may hold what a stall had dammed up."""
+        return self._windows_off_rate >= 2
 
     def feed(self, now: float, samples: list[T]) -> list[tuple[float, T]]:
         """Take the samples that have arrived by ``now``, oldest first; return those whose times are settled."""
@@ -145,4 +151,5 @@ class SampleClock(Generic[T]):
         self._acquired = True
         self.rate_ratio = self._window_samples * self._nominal / elapsed
         self.windows += 1
+        self._windows_off_rate = 0 if 0.5 <= self.rate_ratio <= 1.05 else self._windows_off_rate + 1
         self._open_window(now)

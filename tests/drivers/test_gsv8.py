@@ -615,6 +615,21 @@ def decode_mutations(count: int, seed: int) -> None:
     assert mixed <= count / 200
 
 
+def test_a_flipped_bit_outside_the_value_costs_the_frame_or_shows_as_a_flag() -> None:
+    decoder = Decoder()
+    values = (1.0, 2.0)
+    for byte, bit in itertools.product([0, 1, 2, 11], range(8)):
+        damaged = bytearray(floats(*values))
+        damaged[byte] ^= 1 << bit
+        decoder.expect("float32", 2)
+        out = decoder.feed(bytes(damaged) + floats(3.0, 4.0) * 3)
+        read = [m for m in out if isinstance(m, Measured)]
+        assert read[-2:] == [Measured("float32", (3.0, 4.0), False, False)] * 2
+        if read[0].values == values:
+            assert byte == 2
+            assert bit < 4
+
+
 def random_bytes(count: int, seed: int) -> None:
     """Noise, rich in bytes that matter; the driver stays in its error family and invents next to nothing."""
     rng = random.Random(seed)
