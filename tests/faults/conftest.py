@@ -1,0 +1,126 @@
+"""A short run on the simulated bench in memory, with faults to order and the hidden truth to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.link import DeviceError
+from rig.bench import Bench
+from rig.engine import Engine, Outcome
+from rig.errors import RigError
+from rig.log.reader import read_log
+from rig.log.writer import LogWriter
+from rig.plan import check_plan, plan
+from rig.protocol import Protocol
+from rig.recorder import Gains
+from rig.scene import Scene
+from rig.signals import StopRequest
+from rig.sim.bench import SimulatedBench
+from rig.toml_file import parse_table
+
+SCENE = Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml"
+PROTOCOL = """
+[[step]]
+do = "home"
+[[step]]
+do = "zero"
+duration_s = 0.5
+[[step]]
+do = "approach"
+speed_mm_per_s = 4.0
+threshold_mN = 8.0
+max_travel_mm = 8.0
+[[step]]
+do = "voltage"
+voltage_V = 1000
+settle_s = 0.5
+[[step]]
+do = "ramp"
+displacement_mm = 6.0
+speed_mm_per_s = 2.0
+[[step]]
+do = "hold"
+duration_s = 2.0
+[[step]]
+do = "return"
+speed_mm_per_s = 4.0
+"""
+
+
+@dataclass
+class Story:
+    """What became of one run: what the software says, and what the simulated hardware did."""
+
+    outcome: Outcome
+    error: RigError | DeviceError | None
+    bench: SimulatedBench
+    log: Path
+    mischief_at: float
+    end: float
+    outputs: list[tuple[float, float]]  # time and the supply's own output, which no driver has seen
+    final_output: float
+
+    @property
+    def took(self) -> float:
+        """Seconds from the mischief to the end of the run."""
+        return self.end - self.mischief_at
+
+    @property
+    def control_words(self) -> list[str]:
+        """What was commanded of the supply, in order, from the log."""
+        return [m.fields["command"] for m in read_log(self.log).messages("/command") if m.fields["device"] == "hv"]
+
+
+Mischief = Callable[[SimulatedBench, StopRequest], None]
+Tell = Callable[..., Story]
+
+
+@pytest.fixture
+def tell(tmp_path: Path) -> Tell:
+    """``tell(mischief, replace)`` runs the short protocol on the simulated bench.
+
+    ``mischief(bench, stop)`` is called once, with 1000 V on and the stage moving. ``replace`` is (old, new) in the
+    scene's text. The story tells the supply's true output about five times a second.
+    """
+
+    def run(mischief: Mischief | None = None, *, replace: tuple[str, str] | None = None) -> Story:
+        text = SCENE.read_text()
+        if replace is not None:
+            assert replace[0] in text
+            text = text.replace(*replace)
+        scene = parse_table(text, Scene, "scene", "test")
+        actions = plan(parse_table(PROTOCOL, Protocol, "protocol", "test"), scene)
+        check_plan(actions, scene)
+        bench = Bench(scene)
+        assert bench.simulated is not None
+        simulated, clock, stop = bench.simulated, bench.clock, StopRequest()
+        outputs: list[tuple[float, float]] = []
+        done_at: list[float] = []
+
+        def progress(done: float, total: float, label: str) -> None:
+            now = clock.now()
+            outputs.append((now, float(simulated.world.voltage(np.array([now]))[0])))
+            if mischief is not None and "ramp: 0 to 6 mm" in label and not done_at:
+                moving = simulated.world.stage.end > now
+                if moving:
+                    done_at.append(now)
+                    mischief(simulated, stop)
+
+        path = tmp_path / "run.mcap"
+        with LogWriter(path) as log:
+            engine = Engine(bench, actions, log, Gains(force=0.5), stop, progress)
+            outcome, error = engine.run()
+            bench.close()
+            if not engine.recorder.log_failed:
+                log.finish(outcome.as_text())
+        now = clock.now()
+        final = float(simulated.world.voltage(np.array([now]))[0])
+        return Story(outcome, error, simulated, path, done_at[0] if done_at else now, now, outputs, final)
+
+    return run

@@ -1,0 +1,113 @@
+"""Whatever ends a run, the simulated supply's own output is off at its end, and the log says why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from drivers.link import DeviceError, DeviceLost
+from rig.errors import FaultError, LimitError, Stopped
+from rig.log.errors import LogError
+from rig.log.reader import read_log
+from rig.log.writer import LogWriter
+from rig.signals import StopRequest
+from rig.sim.bench import SimulatedBench
+from rig.sim.settings import Fault
+
+Tell = Callable[..., Any]  # of conftest.Story
+RAMP_DOWN_S = 1000 / 300 + 1.0  # from 1000 V at the scene's 300 V/s, and a second for polling
+AT_ONCE_S = 1.5
+
+
+def inject(role: str, kind: str, **more: Any) -> Callable[[SimulatedBench, StopRequest], None]:
+    return lambda bench, stop: bench.inject(Fault(role=role, kind=kind, **more))
+
+
+def test_a_whole_run_ends_off_and_really_had_voltage(tell: Tell) -> None:
+    story = tell()
+    assert story.outcome.status == "complete" and story.error is None
+    assert max(output for _, output in story.outputs) == pytest.approx(1000, rel=2e-3)
+    assert story.outcome.safe and abs(story.final_output) < 1.0
+    assert story.control_words[:3] == ["arm", "set_voltage", "switch_on"]
+    assert story.control_words[-1] == "switch_off"
+
+
+def test_a_stop_ramps_down(tell: Tell) -> None:
+    story = tell(lambda bench, stop: stop.ask("a test"))
+    assert isinstance(story.error, Stopped) and story.outcome.status == "stopped"
+    assert abs(story.final_output) < 60 and story.outcome.safe
+    assert 1.0 < story.took < RAMP_DOWN_S
+    assert "emergency_off" not in story.control_words
+    assert read_log(story.log).outcome["status"] == "stopped"  # type: ignore[index]
+
+
+def test_a_second_stop_takes_the_output_off_at_once(tell: Tell) -> None:
+    def twice(bench: SimulatedBench, stop: StopRequest) -> None:
+        stop.ask("a test")
+        stop.ask("a test")
+
+    story = tell(twice)
+    assert isinstance(story.error, Stopped)
+    assert abs(story.final_output) < 60 and story.outcome.safe and story.took < AT_ONCE_S
+    assert story.control_words[-1] == "emergency_off"
+
+
+def test_a_film_stiffer_than_believed_stops_at_the_force_limit(tell: Tell) -> None:
+    # Predicted with the believed material, the protocol stays below; the true film does not.
+    story = tell(replace=("mu_Pa = [5e3, 35e3]", "mu_Pa = [75e3, 525e3]"))
+    assert isinstance(story.error, LimitError), story.error
+    assert "force" in story.outcome.reason and "N is outside" in story.outcome.reason
+    assert abs(story.final_output) < 60 and story.outcome.safe
+    assert story.control_words[-1] == "emergency_off"
+
+
+@pytest.mark.parametrize("role", ["stage", "force", "displacement", "hv"])
+@pytest.mark.parametrize("kind", ["vanish", "silent"])
+def test_a_device_lost_or_silent_ends_the_run(tell: Tell, role: str, kind: str) -> None:
+    story = tell(inject(role, kind))
+    assert isinstance(story.error, (DeviceError, FaultError)), story.error
+    assert story.outcome.status == "fault" and role in story.outcome.reason
+    if role != "hv":
+        assert abs(story.final_output) < 60 and story.outcome.safe and story.took < 1.0 + AT_ONCE_S
+    elif kind == "silent":  # commands still reach it, but nothing proves that
+        assert abs(story.final_output) < 60 and not story.outcome.safe
+    else:
+        assert isinstance(story.error, DeviceLost)
+        assert not story.outcome.safe
+
+
+def test_a_supply_that_ignores_off_is_called_not_safe(tell: Tell) -> None:
+    story = tell(inject("hv", "stuck_on"))
+    assert story.final_output > 900
+    assert not story.outcome.safe
+    events = [message.fields["message"] for message in read_log(story.log).messages("/event")]
+    assert any(text.startswith("NOT SAFE") for text in events)
+
+
+def test_a_breakdown_takes_the_output_off_at_once(tell: Tell) -> None:
+    story = tell(inject("hv", "breakdown"))
+    assert isinstance(story.error, (LimitError, FaultError)), story.error
+    assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S
+
+
+def test_a_supply_found_live_is_reported_and_left_alone(tell: Tell) -> None:
+    story = tell(replace=("[simulation.hv]", "[simulation.hv]\nstart_live_V = 500.0"))
+    assert isinstance(story.error, FaultError)
+    assert "cannot be armed" in story.outcome.reason
+    assert story.final_output == pytest.approx(500, abs=5)
+    assert "set_voltage" not in story.control_words and "switch_off" not in story.control_words
+    assert not story.outcome.safe
+
+
+def test_a_log_that_cannot_be_written_ends_the_run(tell: Tell, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill_the_disk(bench: SimulatedBench, stop: StopRequest) -> None:
+        def full(self: LogWriter, data: bytes) -> None:
+            raise LogError(self.path, "writing failed (No space left on device)")
+
+        monkeypatch.setattr(LogWriter, "tick", full)
+
+    story = tell(fill_the_disk)
+    assert isinstance(story.error, LogError)
+    assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S
