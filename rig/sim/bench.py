@@ -215,7 +215,7 @@ class SimulatedBench:
                 if fault.kind == "saturate":
                     instrument.saturated = (-1 if fault.value is not None and fault.value < 0 else 1) if begins else 0
                 else:
-                    instrument.wrong_status = (3 if fault.value is None else int(fault.value) & 3) if begins else 0
+                    instrument.set_status((3 if fault.value is None else int(fault.value) & 3) if begins else 0)
             case KeyenceLKG():
                 match fault.kind:
                     case "alert":

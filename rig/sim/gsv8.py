@@ -55,8 +55,8 @@ class GSV8:
 
     Attributes
     ----------
-    saturated, frozen, wrong_status : faults
-        Sign of the rail the input is stuck at (0: none); the value does not change; bits added to the status byte.
+    saturated : int
+        A fault: sign of the rail the input is stuck at, 0 for none.
     """
 
     def __init__(self, settings: ForceTruth, world: World, wire: ByteWire, rng: np.random.Generator) -> None:
@@ -68,7 +68,8 @@ class GSV8:
         self._buffer = bytearray()
         self._buffer_since = 0.0
         self.saturated = 0
-        self.wrong_status = 0
+        self._wrong_status = 0
+        self._frame: tuple[npt.NDArray[np.uint8], int, int] | None = None
         self._frozen: float | None = None
         # Kept in non-volatile memory
         self._rate = settings.stored_rate_Hz
@@ -98,6 +99,10 @@ class GSV8:
         """A fault: from now on every sample has the value of time ``t``."""
         self._frozen = float(self._bridge(np.array([t]))[0]) if frozen else None
 
+    def set_status(self, bits: int) -> None:
+        """A fault: these bits of the status byte are set in every frame from now on."""
+        self._wrong_status, self._frame = bits, None
+
     # What it measures
 
     def input_range(self, kind: int) -> float:
@@ -126,22 +131,22 @@ class GSV8:
         reading = np.clip(reading, -top, top)
         raw = np.rint((reading - self._zero[self._cell]) / top * 2**23)
         raw = np.clip(raw, -(2**23), 2**23 - 1)
-        width = WIDTH[self._type]
-        size = 3 + CHANNELS * width + 1
-        frames = np.zeros((len(t), size), dtype=np.uint8)
-        frames[:, 0] = 0xAA
-        frames[:, 1] = 0x10 | (CHANNELS - 1)
-        frames[:, 2] = 0x80 | self._type << 4 | self.wrong_status
+        template, at, width = self._template()
+        frames = np.tile(template, (len(t), 1))
+        frames[:, at : at + width] = self._encode(raw, self._cell)
         frames[overload, 2] |= 1
-        frames[:, -1] = 0x85
-        idle = self._encode(np.zeros(1), 0)
-        for channel in range(CHANNELS):
-            at = 3 + channel * width
-            if channel == self._cell:
-                frames[:, at : at + width] = self._encode(raw, channel)
-            else:
-                frames[:, at : at + width] = idle if self._type != FLOAT else self._encode(np.zeros(1), channel)
+        size = template.size
         return frames.tobytes(), size
+
+    def _template(self) -> tuple[npt.NDArray[np.uint8], int, int]:
+        """A frame with nothing on any input; where the load cell's value stands in it, and how wide it is."""
+        if self._frame is None:
+            width = WIDTH[self._type]
+            parts = [self._encode(np.zeros(1), channel).tobytes() for channel in range(CHANNELS)]
+            head = bytes([0xAA, 0x10 | (CHANNELS - 1), 0x80 | self._type << 4 | self._wrong_status])
+            frame = np.frombuffer(head + b"".join(parts) + b"\x85", dtype=np.uint8)
+            self._frame = frame, 3 + self._cell * width, width
+        return self._frame
 
     def _encode(self, raw: Floats, channel: int) -> npt.NDArray[np.uint8]:
         """Raw 24-bit numbers (n,) as bytes (n, width) of the present value type."""
@@ -216,6 +221,7 @@ class GSV8:
         self._wire.send(bytes([0xAA, 0x50 | len(data), error]) + data + b"\x85", t + ANSWER_S)
 
     def _command(self, code: int, p: bytes, t: float) -> None:
+        self._frame = None  # it may look different from now on
         if code not in COMMANDS:
             return self._answer(UNKNOWN, b"", t)
         count = COMMANDS[code]

@@ -216,14 +216,14 @@ class IsegEDCP:
         if not channel.on:
             channel.over_since = math.inf
             return
-        if current > channel.current_limit:
+        if current > channel.current_limit or (channel.limiting and self._needed(channel) > channel.current_limit):
             channel.over_since = min(channel.over_since, t)
             self._over_current(channel, voltage, t)
-        elif channel.limiting and self._needed(channel) <= channel.current_limit:
-            channel.limiting = False
-            self._drive(channel, t)
-        elif not channel.limiting:
+        else:
             channel.over_since = math.inf
+            if channel.limiting:
+                channel.limiting = False
+                self._drive(channel, t)
         if self._world.broken_down and channel.on:
             channel.event |= ARC
         if not channel.ramping and channel.v_bounds and abs(self._measured_v(t) - channel.setpoint) > channel.v_bounds:

@@ -21,6 +21,11 @@ class Path:
     ----------
     x : float
         Where it stands from the beginning of time.
+
+    Attributes
+    ----------
+    changes : int
+        How often it was told to go elsewhere.
     """
 
     def __init__(self, x: float) -> None:
@@ -29,6 +34,7 @@ class Path:
         self._v = [0.0]
         self._a = [0.0]
         self._arrays: tuple[Floats, ...] | None = None
+        self.changes = 0
 
     @property
     def end(self) -> float:
@@ -84,6 +90,7 @@ class Path:
         self._append(t, x, 0.0, 0.0)
 
     def _cut(self, t: float) -> None:
+        self.changes += 1
         while len(self._t) > 1 and self._t[-1] >= t:
             for column in (self._t, self._x, self._v, self._a):
                 column.pop()

@@ -82,6 +82,8 @@ class World:
         self._overstress = [0.0] * len(self._branches)
         self._elastic = 0.0  # F_e at the last tick
         self._tick = 0
+        self._still: tuple[int, int, bool] | None = None
+        self._still_force = 0.0
 
     @property
     def film(self) -> FilmTable:
@@ -111,6 +113,14 @@ class World:
 
     def force(self, t: Floats) -> Floats:
         """Force of the film on the pusher (N) at the times ``t`` (n,), none more than a tick after the last one."""
+        if not self._branches and t[0] >= max(self.stage.end, self.output.end):
+            state = (self.stage.changes, self.output.changes, self.torn)
+            if state != self._still:  # nothing moves: one value for all that follow
+                self._still, self._still_force = state, float(self._force(t[:1])[0])
+            return np.full(t.shape, self._still_force)
+        return self._force(t)
+
+    def _force(self, t: Floats) -> Floats:
         s = self.indentation(t)
         if self.torn or not s.any():
             force = np.zeros_like(s)
@@ -164,8 +174,10 @@ class World:
         else:
             tick = math.floor(t / TICK + 1e-9)
             if tick > self._tick:
+                moved = self.next_time < math.inf
                 self._tick = tick
-                self._check_strength(t)
+                if moved:
+                    self._check_strength(t)
 
     def _one_tick(self, t: float) -> None:
         time = np.array([t])

@@ -1,0 +1,174 @@
+"""The simulated bench in real time, behind one pseudo-terminal per instrument: for drivers on real ports.
+
+The supply's CAN bus is reached through an slcan adapter on its pseudo-terminal. POSIX only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from rig.clock import Clock
+from rig.sim.bench import SimulatedBench
+from rig.sim.slcan import SlcanAdapter
+from rig.sim.wire import ByteWire, FrameWire, WireGone
+
+STEP_S = 0.002  # bytes that arrive by themselves are handed over in bundles of this length, as USB does
+IDLE_S = 0.05  # how often `stop` is asked when nothing happens
+CHUNK = 4096
+
+
+class _Line(Protocol):
+    """A wire as the pseudo-terminal sees it: bytes both ways."""
+
+    def host_write(self, data: bytes, t: float) -> bytes: ...
+
+    def host_read(self, t: float) -> bytes: ...
+
+
+class _Serial:
+    """A serial wire as a `_Line`: nothing is answered at once."""
+
+    def __init__(self, wire: ByteWire) -> None:
+        self._wire = wire
+
+    def host_write(self, data: bytes, t: float) -> bytes:
+        self._wire.host_write(data, t)
+        return b""
+
+    def host_read(self, t: float) -> bytes:
+        return self._wire.host_read(t)
+
+
+class _Port:
+    """One pseudo-terminal. What the host does not read in time is lost, as on a UART, and counted."""
+
+    def __init__(self, line: _Line, wire: ByteWire | FrameWire) -> None:
+        self.line = line
+        self.wire = wire
+        self.lost_bytes = 0
+        self.master = -1
+        self._slave = -1
+        self.open()
+
+    def open(self) -> None:
+        import tty
+
+        self.master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self.master, False)
+        self.name = os.ttyname(self._slave)
+
+    @property
+    def is_open(self) -> bool:
+        return self.master >= 0
+
+    def read(self) -> bytes:
+        try:
+            return os.read(self.master, CHUNK)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> None:
+        try:
+            written = os.write(self.master, data)
+        except BlockingIOError:
+            written = 0
+        self.lost_bytes += len(data) - written
+
+    def close(self) -> None:
+        for descriptor in (self.master, self._slave):
+            if descriptor >= 0:
+                with contextlib.suppress(OSError):
+                    os.close(descriptor)
+        self.master = self._slave = -1
+
+
+class Server:
+    """Serve ``bench`` on pseudo-terminals from now on.
+
+    Parameters
+    ----------
+    bench : SimulatedBench
+        Its time starts with the clock's time at the call of `run`.
+    clock : Clock
+        Real time.
+    """
+
+    def __init__(self, bench: SimulatedBench, clock: Clock) -> None:
+        self._bench = bench
+        self._clock = clock
+        self._ports: dict[str, _Port] = {}
+        try:
+            for role in bench.instruments:
+                wire = bench.wire(role)
+                line: _Line = SlcanAdapter(wire) if isinstance(wire, FrameWire) else _Serial(wire)
+                self._ports[role] = _Port(line, wire)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def ports(self) -> Mapping[str, dict[str, str]]:
+        """By role, the keys of a scene that lead to the instrument: ``port``, or ``interface`` and ``can_channel``.
+
+        A wire that vanished and came back has a new name, as a replugged adapter may have.
+        """
+        return {
+            role: {"interface": "slcan", "can_channel": port.name}
+            if isinstance(port.wire, FrameWire)
+            else {"port": port.name}
+            for role, port in self._ports.items()
+        }
+
+    @property
+    def lost_bytes(self) -> dict[str, int]:
+        """By role, how much the host failed to read in time."""
+        return {
+            role: port.lost_bytes + (port.wire.lost_bytes if isinstance(port.wire, ByteWire) else 0)
+            for role, port in self._ports.items()
+        }
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Serve until ``stop()`` is true; it is asked at least every 50 ms."""
+        start = self._clock.now() - self._bench.now
+        while not stop():
+            now = self._clock.now() - start
+            self._bench.advance(now)
+            for port in self._ports.values():
+                self._hand_over(port, now)
+            open_ports = {port.master: port for port in self._ports.values() if port.is_open}
+            wait = min(max(self._bench.next_time() - now, STEP_S), IDLE_S)
+            ready, _, _ = select.select(list(open_ports), [], [], wait)
+            if ready:
+                now = self._clock.now() - start
+                self._bench.advance(now)
+            for descriptor in ready:
+                self._take(open_ports[descriptor], now)
+
+    def _hand_over(self, port: _Port, now: float) -> None:
+        if port.wire.gone:
+            port.close()
+            return
+        if not port.is_open:
+            port.open()
+        data = port.line.host_read(now)
+        if data:
+            port.write(data)
+
+    def _take(self, port: _Port, now: float) -> None:
+        data = port.read()
+        if not data:
+            return
+        with contextlib.suppress(WireGone):  # pulled in this very moment
+            answer = port.line.host_write(data, now)
+            if answer:
+                port.write(answer)
+
+    def close(self) -> None:
+        """Close all ports; hosts see them vanish."""
+        for port in self._ports.values():
+            port.close()
