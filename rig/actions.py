@@ -134,18 +134,16 @@ def _approach(engine: Engine, action: Action) -> Turns:
             met.append((sample.t, recorder.quantity_of(sample)))
 
     with _listening(engine, listen):
-        try:
-            engine.move_stage(goal, action.speed)
-            end = engine.clock.now() + _patience(action)
-            while not (len(met) >= n and np.mean([force for _, force in met[-n:]]) > threshold):
-                if not stage.moving or engine.clock.now() > end:
-                    raise FaultError(
-                        f"The film was not met within {action.parameters['max_travel'] * 1e3:g} mm of travel. "
-                        "Is the specimen mounted, and the force sensor connected?"
-                    )
-                yield
-        finally:
-            engine.stop_stage()
+        engine.move_stage(goal, action.speed)
+        end = engine.clock.now() + _patience(action)
+        while not (len(met) >= n and np.mean([force for _, force in met[-n:]]) > threshold):
+            if not stage.moving or engine.clock.now() > end:
+                raise FaultError(
+                    f"The film was not met within {action.parameters['max_travel'] * 1e3:g} mm of travel. "
+                    "Is the specimen mounted, and the force sensor connected?"
+                )
+            yield
+        engine.stop_stage()
     yield from _wait(engine, lambda: not stage.moving, GRACE_S, "The stage's standstill")
     if recorder.has_laser:
         recorder.contact, error = yield from _contact_by_laser(engine)

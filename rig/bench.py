@@ -149,18 +149,25 @@ class Bench:
                         device=table.device,
                         axis=table.axis,
                         poll_rate_Hz=table.poll_rate_Hz,
+                        timeout_s=table.timeout_s,
                     )
                     self.devices[role] = self.stage
                 case GSV8Table():
                     from drivers.gsv8 import GSV8
 
-                    self.force = GSV8(role, bytes_of(role), channel=table.channel, rate_Hz=table.rate_Hz)
+                    self.force = GSV8(
+                        role, bytes_of(role), channel=table.channel, rate_Hz=table.rate_Hz, timeout_s=table.timeout_s
+                    )
                     self.devices[role] = self.force
                 case KeyenceTable():
                     from drivers.keyence_lkg import KeyenceLKG
 
                     self.displacement = KeyenceLKG(
-                        role, bytes_of(role), output=table.output, poll_rate_Hz=table.poll_rate_Hz
+                        role,
+                        bytes_of(role),
+                        output=table.output,
+                        poll_rate_Hz=table.poll_rate_Hz,
+                        timeout_s=table.timeout_s,
                     )
                     self.devices[role] = self.displacement
                 case IsegTable():
@@ -172,6 +179,7 @@ class Bench:
                         module=table.module,
                         channel=table.channel,
                         poll_rate_Hz=table.poll_rate_Hz,
+                        timeout_s=table.timeout_s,
                     )
                     self.devices[role] = self.hv
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,8 +28,7 @@ if TYPE_CHECKING:
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
 SETUP_LIMIT_S = 15.0
-SILENCE_PERIODS = 10.0  # a sensor silent for this many of its periods, and at least SILENCE_S, is a fault
-SILENCE_S = 0.5
+SILENCE_PERIODS = 10.0  # a sensor silent for this many periods, and longer than two of its time-outs, is a fault
 FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
 SAFE_LIMIT_S = 60.0  # a ramp down takes as long as it takes; after this the output is called NOT SAFE
 
@@ -224,12 +224,12 @@ class Engine:
                 }
             )
             label = f"step {action.step} {action.kind}: {action.label}"
-            turns = carry_out(self, action)
-            for _ in turns:
-                if self.clock.now() >= self._next_progress:
-                    self._next_progress = self.clock.now() + 0.2
-                    self._progress(done + min(self.clock.now() - began, action.duration), total, label)
-                self._turn()
+            with closing(carry_out(self, action)) as turns:
+                for _ in turns:
+                    if self.clock.now() >= self._next_progress:
+                        self._next_progress = self.clock.now() + 0.2
+                        self._progress(done + min(self.clock.now() - began, action.duration), total, label)
+                    self._turn()
             done += action.duration
             self._progress(done, total, label)
 
@@ -283,7 +283,10 @@ class Engine:
             rates["displacement"] = bench.displacement.rate
         if bench.scene.hv is not None:
             rates["hv"] = bench.scene.hv.poll_rate_Hz
-        return {role: max(SILENCE_S, SILENCE_PERIODS / rate) for role, rate in rates.items()}
+        return {
+            role: max(2 * self.bench.scene.instruments[role].timeout_s, SILENCE_PERIODS / rate)
+            for role, rate in rates.items()
+        }
 
     # The end -------------------------------------------------------------------------------------------------
 

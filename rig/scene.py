@@ -18,7 +18,7 @@ from model.specimen import Specimen
 from rig.errors import ConfigError
 from rig.sim.settings import SimulationSettings
 from rig.table import Table
-from rig.toml_file import load_table
+from rig.toml_file import load_table, validate
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -106,6 +106,7 @@ class SerialTable(Table):
     """What every instrument on a serial port has."""
 
     port: str | None = Field(default=None, min_length=1)
+    timeout_s: float = Field(default=0.25, gt=0, le=10)
     serial: str | None = None
     certificate: str | None = None
 
@@ -151,6 +152,7 @@ class IsegTable(Table):
     channel: int = Field(default=0, ge=0, le=23)
     ramp_V_per_s: Positive = 100.0
     poll_rate_Hz: float = Field(default=10.0, gt=0, le=50)
+    timeout_s: float = Field(default=0.25, gt=0, le=10)
     serial: str | None = None
     certificate: str | None = None
 
@@ -211,10 +213,7 @@ class Scene(Table):
             if role not in ports:
                 raise ConfigError(f"The ports name no {role!r}; they name {', '.join(sorted(ports)) or 'nothing'}.")
             raw[role].update(ports[role])
-        try:
-            return Scene.model_validate(raw)
-        except ValueError as error:
-            raise ConfigError(f"The ports do not fit the scene: {error}") from None
+        return validate(raw, Scene, "scene", "scene with these ports")
 
 
 def is_connected(table: Table) -> bool:

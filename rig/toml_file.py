@@ -57,6 +57,11 @@ def parse_table(text: str, table: type[T], kind: str, source: str) -> T:
         raise ConfigError(f"{source}: not valid TOML: {error}.") from None
     except (RecursionError, ValueError) as error:
         raise ConfigError(f"{source}: not a usable {kind} file: {error}.") from None
+    return validate(raw, table, kind, source)
+
+
+def validate(raw: dict[str, Any], table: type[T], kind: str, source: str) -> T:
+    """Hold a parsed file against ``table``; ``source`` names it in errors."""
     try:
         return table.model_validate(raw)
     except ValidationError as error:
