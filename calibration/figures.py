@@ -82,7 +82,11 @@ def force_displacement(identification: Identification, curves: Sequence[Curve], 
             for index in members:
                 curve, selection = curves[index], selections[index]
                 colour, marker, dash = styles[abs(curve.nominal_voltage)]
-                _samples(ax, curve.h, curve.force, selection.used, colour, scale=1.0)
+                used, left = selection.used, ~selection.used
+                ax.plot(
+                    curve.h[used] * 1e3, curve.force[used], ".", color=colour, ms=1.2, alpha=0.3, mew=0, rasterized=True
+                )
+                ax.plot(curve.h[left] * 1e3, curve.force[left], "x", color="#999999", ms=3, mew=0.6, rasterized=True)
                 for direction, fill in ((1, colour), (0, colour), (-1, "white")):
                     rows = selection.used & (curve.direction == direction)
                     h, force, _ = _binned(curve.h[rows], curve.force[rows])
@@ -109,60 +113,60 @@ def residuals(identification: Identification, curves: Sequence[Curve], selection
 
     def draw(figure: Any) -> None:
         axes = figure.subplots(len(voltages), len(groups), sharex="col", sharey=True, squeeze=False)
+        largest = 0.0
         for column, members in enumerate(groups.values()):
             for row, voltage in enumerate(voltages):
                 ax = axes[row, column]
                 for index in members:
                     if abs(curves[index].nominal_voltage) == voltage and selections[index].used.any():
-                        _residual_panel(ax, identification, curves[index], selections[index], styles[voltage])
+                        panel = (ax, identification, curves[index], selections[index], styles[voltage])
+                        largest = max(largest, _residual_panel(*panel))
                 ax.axhline(0.0, color="black", lw=0.8, zorder=2)
                 ax.set_title(f"{list(groups)[column].split(',')[0]}, {voltage:g} V")
         for ax in axes[-1]:
             ax.set_xlabel("displacement h / mm")
         for ax in axes[:, 0]:
             ax.set_ylabel("residual / mN")
+        axes[0, 0].set_ylim(-1.15 * largest, 1.15 * largest)
         figure.align_ylabels()
 
     return _svg(draw, width=4.2 * max(len(groups), 1.3), height=0.7 + 1.75 * len(voltages))
 
 
 def stiffness(identification: Identification, truth: Material | None) -> str:
-    """Secant shear modulus against stretch with its 95 % band, and where the data determine it best."""
+    """Secant shear modulus against stretch, and its 95 % band enlarged."""
     curve = identification.stiffness_curve
-    stretch = np.array(curve.meridional_stretch)
-    value, deviation = np.array(curve.secant_modulus) * 1e-3, np.array(curve.uncertainty) * 1e-3
-    at = identification.stretch[0]
-    best = identification.quantities["stiffness"]
+    stretch, value = np.array(curve.meridional_stretch), np.array(curve.secant_modulus)
+    band = 196.0 * np.array(curve.uncertainty) / value
+    at, best = identification.stretch[0], identification.quantities["stiffness"]
+    hidden = None if truth is None else np.array([secant_modulus(truth, float(s), curve.hoop_stretch) for s in stretch])
 
     def draw(figure: Any) -> None:
-        ax = figure.subplots()
-        ax.fill_between(stretch, value - 1.96 * deviation, value + 1.96 * deviation, color="#56B4E9", alpha=0.35, lw=0)
-        ax.plot(stretch, value, color="#0072B2", lw=1.6)
-        handles = [_line(color="#0072B2", lw=1.6, label="identified"), _patch("#56B4E9", "95 % interval")]
-        if truth is not None:
-            hidden = [secant_modulus(truth, float(s), curve.hoop_stretch) * 1e-3 for s in stretch]
-            ax.plot(stretch, hidden, color="black", lw=1.2, ls="--")
-            handles.append(_line(color="black", lw=1.2, ls="--", label="truth of the simulation"))
-        ax.errorbar(at, best.value * 1e-3, 1.96e-3 * best.uncertainty, fmt="o", color="#D55E00", ms=5, capsize=3)
-        handles.append(_line(color="#D55E00", marker="o", ls="none", ms=5, label=f"best determined, at {at:.2f}"))
-        low, high = ax.get_ylim()
-        ax.set_ylim(max(low, 0.0), min(high, 2.0 * value.max()))
-        ax.set_xlabel(f"meridional stretch $\\lambda_1$ (hoop stretch {curve.hoop_stretch:.3g})")
-        ax.set_ylabel("secant shear modulus / kPa")
-        ax.legend(handles=handles, loc="upper left")
+        left, right = figure.subplots(1, 2)
+        left.plot(stretch, value * 1e-3, color="#0072B2", lw=1.6, label="identified")
+        right.fill_between(stretch, -band, band, color="#56B4E9", alpha=0.4, lw=0, label="95 % interval")
+        right.axhline(0.0, color="#0072B2", lw=1.6)
+        if hidden is not None:
+            left.plot(stretch, hidden * 1e-3, color="black", lw=1.2, ls="--", label="truth of the simulation")
+            right.plot(stretch, 100.0 * (hidden / value - 1.0), color="black", lw=1.2, ls="--")
+        left.plot(at, best.value * 1e-3, "o", color="#D55E00", ms=5, label=f"best determined, at {at:.2f}")
+        right.errorbar(at, 0.0, 196.0 * best.relative, fmt="o", color="#D55E00", ms=5, capsize=3)
+        reach = min(20.0, 4.0 * float(np.median(band)))
+        right.set_ylim(-reach, reach)
+        left.set_title("(a) identified stiffness")
+        right.set_title("(b) difference from it")
+        left.set_ylabel("secant shear modulus / kPa")
+        right.set_ylabel("difference / %")
+        for ax in (left, right):
+            ax.set_xlabel(f"meridional stretch $\\lambda_1$ (hoop stretch {curve.hoop_stretch:.3g})")
+            ax.legend(loc="upper left")
 
-    return _svg(draw, width=5.4, height=3.3)
+    return _svg(draw, width=8.4, height=3.2)
 
 
 def _styles(curves: Sequence[Curve]) -> dict[float, tuple[str, str, Any]]:
     voltages = sorted({abs(curve.nominal_voltage) for curve in curves})
     return {voltage: STYLES[k % len(STYLES)] for k, voltage in enumerate(voltages)}
-
-
-def _samples(ax: Axes, h: Array, y: Array, used: NDArray[np.bool_], colour: str, scale: float) -> None:
-    """Single samples, faint and as pixels; those left out as grey crosses."""
-    ax.plot(h[used] * 1e3, y[used] * scale, ",", color=colour, alpha=0.25, zorder=1, rasterized=True)
-    ax.plot(h[~used] * 1e3, y[~used] * scale, "x", color="#999999", ms=3, mew=0.6, zorder=1, rasterized=True)
 
 
 def _binned(h: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -182,33 +186,22 @@ def _binned(h: Array, y: Array) -> tuple[Array, Array, Array]:
 
 def _residual_panel(
     ax: Axes, identification: Identification, curve: Curve, selection: Selection, style: tuple[str, str, Any]
-) -> None:
+) -> float:
+    """Draw the bin means of one curve's residuals; the largest of them (mN), two standard errors included."""
     colour, marker, _ = style
     used = selection.used
-    h = curve.h[used]
     grid = np.linspace(selection.low, selection.high, 200)
     force = model_force(identification, curve, grid, reference_voltage(curve, used))
-    residual = (curve.force[used] - np.interp(h, grid, force)) * 1e3
-    _samples(ax, h, residual, np.ones(h.size, dtype=np.bool_), colour, scale=1.0)
-    for direction, fill, shift in ((1, colour, -0.004), (0, colour, 0.0), (-1, "white", 0.004)):
+    h, residual = curve.h[used], (curve.force[used] - np.interp(curve.h[used], grid, force)) * 1e3
+    largest = 0.0
+    for direction, fill, side in ((1, colour, -1.0), (0, colour, 0.0), (-1, "white", 1.0)):
         rows = curve.direction[used] == direction
-        mean_h, mean, error = _binned(h[rows], residual[rows])
-        if mean_h.size:
-            place = mean_h * 1e3 + shift * (selection.high - selection.low) * 1e3  # side by side, not on top
-            ax.errorbar(
-                place,
-                mean,
-                2 * error,
-                fmt=marker,
-                ms=3.5,
-                mfc=fill,
-                mec=colour,
-                ecolor=colour,
-                elinewidth=0.9,
-                zorder=3,
-            )
-    noise = 2e3 * curve.force_noise
-    ax.fill_between(grid * 1e3, -noise, noise, color="#000000", alpha=0.05, lw=0, zorder=0)
+        at, mean, error = _binned(h[rows], residual[rows])
+        if at.size:
+            place = 1e3 * (at + 0.004 * side * (selection.high - selection.low))  # side by side, not on top
+            ax.errorbar(place, mean, 2 * error, fmt=marker, ms=3.5, mfc=fill, mec=colour, ecolor=colour, elinewidth=0.9)
+            largest = max(largest, float((np.abs(mean) + 2 * error).max()))
+    return largest
 
 
 def _legend(styles: dict[float, tuple[str, str, Any]]) -> list[Any]:
@@ -227,12 +220,6 @@ def _line(**style: Any) -> Any:
     from matplotlib.lines import Line2D
 
     return Line2D([], [], **style)
-
-
-def _patch(colour: str, label: str) -> Any:
-    from matplotlib.patches import Patch
-
-    return Patch(color=colour, alpha=0.35, lw=0, label=label)
 
 
 def _svg(draw: Any, *, width: float, height: float) -> str:

@@ -397,13 +397,13 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
     words = []
     if not fit.converged:
         words.append(f"the fit did not converge in {fit.evaluations} evaluations; its numbers are provisional")
-    for name, quantity in result.quantities.items():
-        if quantity.at_bound:
-            words.append(f"{name} ended at the edge of its allowed range: it is not determined by this data")
-        elif quantity.verdict.startswith("not"):
-            words.append(
-                f"{name} is not determined by this data: its standard uncertainty is {_share(quantity.relative)}"
-            )
+    edge = [name for name, quantity in result.quantities.items() if quantity.at_bound]
+    if edge:
+        words.append(f"{', '.join(edge)} ended at the edge of the allowed range: not determined by this data")
+    lost = {name: q for name, q in result.quantities.items() if q.verdict.startswith("not") and not q.at_bound}
+    if lost:
+        shares = ", ".join(f"{name} to {_share(quantity.relative)}" for name, quantity in lost.items())
+        words.append(f"not determined by this data: {shares} (standard uncertainty over value)")
     if result.lack_of_fit_probability < SIGNIFICANT:
         ratio = math.sqrt(result.lack_of_fit / result.lack_of_fit_freedom)
         words.append(
@@ -435,7 +435,7 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
 
 
 def _share(relative: float) -> str:
-    return f"{relative:.0%} of its value" if relative <= 10.0 else "more than ten times its value"
+    return f"{100 * relative:.0f} %" if relative <= 10.0 else "more than 1000 %"
 
 
 def _curve_warnings(curve: CurveResult, direction: NDArray[np.int8], per_independent: float) -> list[str]:

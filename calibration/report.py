@@ -114,6 +114,7 @@ def _render(
         convention=CONVENTION,
         thresholds=(f"{IDENTIFIED:.0%}", f"{WEAKLY_IDENTIFIED:.0%}"),
         specimens=list(dict.fromkeys(curve.specimen.name or "unnamed" for curve in curves)),
+        noise=" or ".join(f"{noise:.3g}" for noise in sorted({1e3 * curve.force_noise for curve in curves})),
         force_displacement=_data_uri(figures.force_displacement(identification, curves, selections)),
         residuals=_data_uri(figures.residuals(identification, curves, selections)),
         stiffness=_data_uri(figures.stiffness(identification, truth)),
@@ -183,7 +184,7 @@ def rounded(value: float, uncertainty: float) -> tuple[str, str]:
     """Value and uncertainty as text, to two significant digits of the uncertainty."""
     if not math.isfinite(uncertainty) or uncertainty <= 0.0:
         return f"{value:.4g}", "not determined" if uncertainty > 0.0 else "0"
-    digits = max(0, 1 - math.floor(math.log10(uncertainty)))
+    digits = max(0, 1 - math.floor(math.log10(float(f"{uncertainty:.1e}"))))
     return f"{value:.{digits}f}", f"{uncertainty:.{digits}f}"
 
 
@@ -193,8 +194,8 @@ def percent(fraction: float) -> str:
         return "> 1000 %"
     if fraction < 5e-6:
         return "0 %"
-    digits = max(0, 1 - math.floor(math.log10(100 * fraction)))
-    return f"{100 * fraction:.{digits}f} %"
+    value = float(f"{100 * fraction:.1e}")
+    return f"{value:.{max(0, 1 - math.floor(math.log10(value)))}f} %"
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
