@@ -100,3 +100,10 @@ def test_files_that_are_not_certificates(tmp_path: Path) -> None:
     binary.write_bytes(b"\x89MCAP0\r\n\xff")
     with pytest.raises(CertificateError, match="not a TOML file"):
         load_certificate(binary)
+
+
+def test_the_examples_are_for_the_instruments_that_the_simulation_has() -> None:
+    from rig.sim.settings import ForceTruth, HVTruth
+
+    for name, serial in (("force", ForceTruth().serial_number), ("hv", HVTruth().serial_number)):
+        assert load_certificate(EXAMPLES / f"{name}.toml").check(str(serial), date(2020, 1, 1)) == []

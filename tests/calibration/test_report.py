@@ -49,6 +49,13 @@ def found(curves: list[Curve]) -> Identification:
 
 
 @pytest.fixture(scope="module")
+def small(experiment: Experiment) -> tuple[Identification, list[Curve]]:
+    """One curve, one term, no voltage."""
+    curves = experiment(seed=12, samples=200, voltages=(0.0,), disks=(4e-3,))
+    return identify(curves, terms=1, starts=1), curves
+
+
+@pytest.fixture(scope="module")
 def html(tmp_path_factory: pytest.TempPathFactory, found: Identification, curves: list[Curve]) -> str:
     path = tmp_path_factory.mktemp("report") / "report.html"
     write_report(
@@ -108,30 +115,31 @@ def test_what_comes_from_files_is_escaped(html: str) -> None:
     assert Page(html).text.count("<script>alert(1)</script> & \"'") >= 4  # label, scene's name, scene, log
 
 
-def test_it_is_the_same_each_time(tmp_path: Path, found: Identification, curves: list[Curve]) -> None:
+def test_it_is_the_same_each_time(tmp_path: Path, small: tuple[Identification, list[Curve]]) -> None:
     paths = [tmp_path / "one.html", tmp_path / "two.html"]
     for path in paths:
-        write_report(path, found, curves, scene_texts={}, provenance={})
+        write_report(path, *small, scene_texts={}, provenance={})
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
 def test_a_failure_leaves_the_old_report_and_nothing_else(
-    tmp_path: Path, found: Identification, curves: list[Curve]
+    tmp_path: Path, small: tuple[Identification, list[Curve]]
 ) -> None:
     path = tmp_path / "report.html"
     path.write_text("old")
     with pytest.raises(UnicodeEncodeError):
-        write_report(path, found, curves, scene_texts={"scene": "\ud800"}, provenance={})
+        write_report(path, *small, scene_texts={"scene": "\ud800"}, provenance={})
     assert path.read_text() == "old"
     assert [item.name for item in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(FileNotFoundError):
-        write_report(tmp_path / "none" / "report.html", found, curves, scene_texts={}, provenance={})
+        write_report(tmp_path / "none" / "report.html", *small, scene_texts={}, provenance={})
 
 
-def test_without_voltage_the_report_has_no_permittivity(tmp_path: Path, experiment: Experiment) -> None:
-    curves = experiment(seed=12, samples=200, voltages=(0.0,), disks=(4e-3,))
+def test_without_voltage_the_report_has_no_permittivity(
+    tmp_path: Path, small: tuple[Identification, list[Curve]]
+) -> None:
     path = tmp_path / "report.html"
-    write_report(path, identify(curves, terms=1, starts=1), curves, scene_texts={}, provenance={})
+    write_report(path, *small, scene_texts={}, provenance={})
     assert "ermittivity" not in path.read_text()
 
 
