@@ -425,15 +425,18 @@ def _viewer(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _last_words(folder: Path) -> str:
-    text = (folder / "messages.txt").read_text(errors="replace")
-    return _printable(re.sub(r"\x1b\[[0-9;]*m", "", text).strip()[-600:])
+    """What the viewer said, from where it gave up if it did, without colours and control characters."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", (folder / "messages.txt").read_text(errors="replace"))
+    panic = text.find("panicked at")
+    words = text[panic:].splitlines()[:2] if panic >= 0 else text.splitlines()[-3:]
+    return _printable(" ".join(words))
 
 
 def _why_no_picture(messages: str) -> str:
-    if re.search("adapter|vulkan|wgpu|graphics", messages, re.IGNORECASE):
+    if re.search("adapter|vulkan|wgpu|render", messages, re.IGNORECASE):
         return (
             "A picture needs a graphics driver, and this machine offers none. On Debian or Ubuntu a driver that needs "
-            "no graphics card is installed by: sudo apt install mesa-vulkan-drivers"
+            f"no graphics card is installed by: sudo apt install mesa-vulkan-drivers (the viewer said: {messages})"
         )
     return f"The viewer ended before the picture was made. Its last words: {messages}"
 
