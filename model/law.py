@@ -53,13 +53,14 @@ class Film:
         )
 
     def powers(self, log_stretch: Array) -> Array:
-        """``exp(al_n X) - 1`` of every term, (terms, 3, points, S), where ``log_stretch`` stacks L1, L2, -(L1+L2)."""
-        exponents: Array = self.alpha.reshape(self.alpha.shape[0], 1, 1, -1) * log_stretch
+        """``exp(al_n X) - 1`` of every term, (terms, 3, ..., S), where ``log_stretch`` stacks L1, L2, -(L1+L2)."""
+        alpha = self.alpha.reshape(len(self.alpha), *(1,) * (log_stretch.ndim - 1), -1)
+        exponents: Array = alpha * log_stretch
         return np.expm1(exponents, out=exponents)
 
     def sums(self, powers: Array) -> tuple[Array, Array]:
-        """``sum mu_n (l^al_n - 1)`` and ``sum mu_n al_n l^al_n`` of L1, L2, -(L1+L2), each (3, points, S)."""
-        self.count.mechanical += powers.shape[2] * powers.shape[3]
+        """``sum mu_n (l^al_n - 1)`` and ``sum mu_n al_n l^al_n`` of L1, L2, -(L1+L2), each (3, ..., S)."""
+        self.count.mechanical += powers[0, 0].size
         stiffness = self.mu * self.alpha
         if self.mu.shape[1] == 1:
             flat = powers.reshape(powers.shape[0], -1)
@@ -75,15 +76,15 @@ class Film:
         return stress, modulus
 
     def maxwell(self, log_stretch: Array) -> Array:
-        """Maxwell stress ``k l1^2 l2^2`` (points, S)."""
+        """Maxwell stress ``k l1^2 l2^2`` (..., S)."""
         assert self.field is not None
-        self.count.electric += log_stretch.shape[1] * log_stretch.shape[2]
+        self.count.electric += log_stretch[0].size
         stress: Array = self.field * np.exp(-2.0 * log_stretch[2])
         return stress
 
 
 def stack(log1: Array, log2: Array) -> Array:
-    """L1, L2, L3 = -(L1+L2), of shape (3, points, S)."""
+    """L1, L2, L3 = -(L1+L2), of shape (3, ..., S)."""
     out = np.empty((3, *log1.shape))
     out[0] = log1
     out[1] = log2
@@ -94,7 +95,7 @@ def stack(log1: Array, log2: Array) -> Array:
 
 @dataclass(slots=True)
 class Stress:
-    """Stresses and tangent moduli in logarithmic stretch at points (points, S), units of G."""
+    """Stresses and tangent moduli in logarithmic stretch at points (..., S), units of G."""
 
     t1: Array
     t2: Array
@@ -102,10 +103,20 @@ class Stress:
     h12: Array
     h22: Array
     maxwell: Array | None
+    relief: Relief | None = None
+
+
+@dataclass(slots=True)
+class Relief:
+    """How the natural hoop stretch follows where the film is relaxed: ``dL2 = change + rate dL1``; zero elsewhere."""
+
+    change: Array
+    rate: Array
+    regular: NDArray[np.bool_]  # d(sigma2)/dL2 > 0: a natural stretch exists
 
 
 def stress(film: Film, log_stretch: Array) -> Stress:
-    """True stress ``dW*/dL_i`` and tangent ``d2W*/dL_i dL_j`` at stacked log stretches (3, points, S)."""
+    """True stress ``dW*/dL_i`` and tangent ``d2W*/dL_i dL_j`` at stacked log stretches (3, ..., S)."""
     m, a = film.sums(film.powers(log_stretch))
     t1 = m[0] - m[2]
     t2 = m[1] - m[2]
@@ -122,3 +133,25 @@ def stress(film: Film, log_stretch: Array) -> Stress:
     h12 -= b2
     h22 -= b2
     return Stress(t1, t2, h11, h12, h22, b)
+
+
+def relax(film: Film, law: Stress, where: NDArray[np.bool_]) -> Stress:
+    """The law with the hoop stretch eliminated ``where`` the film is wrinkled, so that the hoop stress is zero.
+
+    Eliminating L2 from ``sigma2 + h12 dL1 + h22 dL2 = 0`` leaves ``h11 - h12^2/h22`` along the film and no resistance
+    around it.
+    """
+    film.count.relaxed += int(np.count_nonzero(where))
+    give = np.where(where, 1.0 / law.h22, 0.0)
+    rate = -law.h12 * give
+    change = -law.t2 * give
+    keep = ~where
+    return Stress(
+        t1=law.t1 + law.h12 * change,
+        t2=law.t2 * keep,
+        h11=law.h11 + law.h12 * rate,
+        h12=law.h12 * keep,
+        h22=law.h22 * keep,
+        maxwell=law.maxwell,
+        relief=Relief(change, rate, np.logical_or(law.h22 > 0.0, keep)),
+    )

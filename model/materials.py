@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-# scipy.constants.epsilon_0 (CODATA 2022), written out because importing SciPy costs a third of a second; a test checks it.
+# scipy.constants.epsilon_0 (CODATA 2022), written out because importing SciPy is slow; a test compares the two.
 EPSILON_0 = 8.8541878188e-12
 
 

@@ -11,13 +11,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.ladder import Answer, climb
+from model import ritz, tension_field, trace
+from model.ladder import Answer, Start, climb, first_modes
 from model.law import Array, Evaluations, Film, stack, stress
-from model.ritz import Problem
+from model.ritz import Grid, Problem
 from model.specimen import Specimen
 
 Wrinkling = Literal["plain", "tension_field"]
 BLOCK = 512  # states solved together: their arrays stay in the processor's cache
+# Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
+# followed from rest.
+SOFTENING = 0.25
+FLAT = -1e-13  # of G: a hoop stress that is zero in the exact solution may come out as round-off
 
 
 class Status(IntEnum):
@@ -201,7 +206,7 @@ def solve_many(
     count = Evaluations()
     with np.errstate(all="ignore"):
         for start in range(0, len(inputs.h), BLOCK):
-            _Block(inputs, slice(start, start + BLOCK), count).solve(result, tolerance, sensitivities)
+            _Block(inputs, slice(start, start + BLOCK), count).solve(result, tolerance, wrinkling, sensitivities)
     return result.solutions(inputs.shape, count)
 
 
@@ -324,35 +329,94 @@ class _Block:
         height = np.where(self.h == 0.0, 1e-9, np.abs(self.h) / self.b)
         self.problem = Problem(film, np.log(self.lp), np.log(self.b / self.a), height)
 
-    def solve(self, result: _Flat, tolerance: float, sensitivities: bool) -> None:
+    def solve(self, result: _Flat, tolerance: float, wrinkling: Wrinkling, sensitivities: bool) -> None:
+        """Solve the block and write what comes out."""
         if len(self.index) == 0:
             return
-        rest = np.arange(len(self.index))
-        problem = self.problem
+        index, problem = np.arange(len(self.index)), self.problem
         if problem.film.field is not None:
             slack = self.slack()
-            result.status[self.index[slack]] = Status.SLACK
             if slack.any():
-                rest = np.flatnonzero(~slack)
-                problem = problem.take(rest)
-        if len(rest) == 0:
-            return
-        answers, failed = climb(problem, tolerance, sensitivities=sensitivities)
+                result.status[self.index[slack]] = Status.SLACK
+                index = np.flatnonzero(~slack)
+                if len(index) == 0:
+                    return
+                problem = problem.take(index)
+        relaxed = wrinkling == "tension_field"
+        grid = Grid.lay(first_modes(float(problem.span.max()), tolerance), problem.whole())
+        start = Start(grid, ritz.guess(problem, grid))
+        answers, lost, steps = climb(problem, tolerance, start, sensitivities=sensitivities)
+        doubtful = [lost]
+        folded = [lost] if relaxed else []
         for answer in answers:
-            self.place(result, rest[answer.index], answer)
-        result.status[self.index[rest[failed.index]]] = Status.NOT_CONVERGED
-        result.whole["iterations"][self.index[rest[failed.index]]] = failed.steps
+            x = answer.extremes
+            soft = x.softening > SOFTENING
+            wrinkled = x.hoop < FLAT if relaxed else np.zeros_like(soft)
+            doubtful.append(answer.index[soft & ~wrinkled])
+            folded.append(answer.index[wrinkled])
+            self.place(result, index, answer, ~(soft | wrinkled))
+        if relaxed:
+            doubtful = doubtful[1:]
+            some = np.concatenate(folded)
+            if len(some):
+                answers, lost, spent = tension_field.solve(problem.take(some), tolerance, sensitivities=sensitivities)
+                steps[some] += spent
+                doubtful.append(some[lost])
+                for answer in answers:
+                    soft = answer.extremes.softening > SOFTENING
+                    answer.index = some[answer.index]
+                    doubtful.append(answer.index[soft])
+                    self.place(result, index, answer, ~soft)
+        some = np.concatenate(doubtful)
+        if len(some):
+            self.follow(result, index, problem, some, steps, tolerance, relaxed, sensitivities)
+        result.whole["iterations"][self.index[index]] = steps
+
+    def follow(
+        self,
+        result: _Flat,
+        index: NDArray[np.intp],
+        problem: Problem,
+        some: NDArray[np.intp],
+        steps: NDArray[np.intp],
+        tolerance: float,
+        relaxed: bool,
+        sensitivities: bool,
+    ) -> None:
+        """Solve states for which a cold start may have missed, or jumped from, the branch that starts at rest."""
+        part = problem.take(some)
+        path = trace.follow(part, max(10, first_modes(float(part.span.max()), 1e-6)), relaxed=relaxed)
+        steps[some] += path.steps
+        status = np.where(path.limit, Status.UNSTABLE, Status.NOT_CONVERGED)
+        result.status[self.index[index[some]]] = status
+        good = np.flatnonzero(path.reached)
+        if len(good) == 0:
+            return
+        here, grid, state = part.take(good), path.grid.take(good), path.state.take(good)
+        if relaxed:
+            answers, _, spent = tension_field.solve(here, tolerance, sensitivities=sensitivities, begin=(grid, state))
+        else:
+            answers, _, spent = climb(here, tolerance, Start(grid, state), sensitivities=sensitivities)
+        steps[some[good]] += spent
+        for answer in answers:
+            answer.index = some[good[answer.index]]
+            self.place(result, index, answer, np.ones(len(answer.index), dtype=np.bool_))
 
     def slack(self) -> NDArray[np.bool_]:
         """Where the film, stretched like a straight cone, would push outwards: no tension can hold it."""
         p = self.problem
         cone = p.height / -np.expm1(-p.span)
-        log = (p.log_prestretch + 0.5 * np.log1p(cone * cone))[None]
-        tension: Array = stress(p.film, stack(log, log)).t1[0]
+        log = p.log_prestretch + 0.5 * np.log1p(cone * cone)
+        tension: Array = stress(p.film, stack(log, log)).t1
         return tension < 0.0
 
-    def place(self, result: _Flat, where: NDArray[np.intp], answer: Answer) -> None:
-        """Write the answer for the block's states ``where``, in SI units."""
+    def place(self, result: _Flat, index: NDArray[np.intp], answer: Answer, these: NDArray[np.bool_]) -> None:
+        """Write ``these`` of an answer's states in SI units; ``index``: the answer's numbers to the block's."""
+        if not these.all():
+            if not these.any():
+                return
+            answer = answer.take(these)
+        where = index[answer.index]
         to = self.index[where]
         h, v, t, shear, lp, b = (x[where] for x in (self.h, self.voltage, self.t, self.shear, self.lp, self.b))
         sign = np.sign(h)
@@ -366,13 +430,14 @@ class _Block:
         result.real["min_meridional_stress"][to] = shear * x.meridional
         result.real["max_stretch"][to] = np.exp(x.log_stretch)
         result.real["error_estimate"][to] = answer.error
-        result.whole["iterations"][to] = answer.steps
-        result.whole["modes"][to] = answer.modes
+        result.whole["modes"][to] = answer.grid.table.modes
         result.flag["stable"][to] = True
         result.flag["field_exceeded"][to] = result.real["peak_field"][to] > self.strength[where]
         result.flag["stretch_exceeded"][to] = result.real["max_stretch"][to] > self.elongation[where]
-        # A hoop stress that is zero in the exact solution (flat, not pre-stretched) may come out as round-off.
-        result.status[to] = np.where(x.hoop >= -1e-13, Status.TAUT, Status.WRINKLED)
+        folded = x.hoop < FLAT
+        if answer.state.relaxed is not None:
+            folded |= answer.state.relaxed.any(axis=(0, 1))
+        result.status[to] = np.where(folded, Status.WRINKLED, Status.TAUT)
         d = answer.derivatives
         if d is None or result.dforce is None:
             return

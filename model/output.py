@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
 
-from model.law import Array, stack, stress
-from model.ritz import Grid, Points, Problem
+from model.law import Array, relax, stack, stress
+from model.ritz import Grid, Index, Points, Problem, State, barycentric, table
+
+FINE = 33  # points of an element where an extreme inside the film is looked for
 
 
 @dataclass(slots=True)
@@ -19,55 +22,122 @@ class Extremes:
     hoop: Array
     meridional: Array
     log_stretch: Array
+    softening: Array  # largest share of the meridional stiffness that the voltage takes away
+
+    def take(self, index: Index) -> Extremes:
+        return Extremes(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
-def edges(problem: Problem, grid: Grid, at: Points, lam: Array) -> tuple[Array, Array, Array]:
-    """``L1``, ``sigma1`` and ``sigma2`` at disk and ring, (2, S) each, as accurate as the force itself.
+@dataclass(slots=True)
+class Edges:
+    """The state at disk and ring, (2, S) each."""
+
+    log1: Array
+    log2: Array
+    t1: Array
+    t2: Array
+
+
+def edges(problem: Problem, grid: Grid, state: State, at: Points, lam: Array) -> Edges:
+    """Stretches and stresses at disk and ring, as accurate as the force itself.
 
     The energy's derivative with respect to the radius of a clamped edge is the horizontal reaction there. It is
     computed with a test function that is 1 at that edge and 0 at the other, and so has an error of the order of the
     shape's squared, as the force has; values extrapolated from the points would not.
     """
     t = grid.table
-    power = t.modes
+    power = t.modes + 1
     half = 0.5 * (1.0 - t.xi)
-    test = np.stack((half**power, (1.0 - half) ** power))  # 1 at disk, 1 at ring
-    slope = 0.5 * power * np.stack((-(half ** (power - 1)), (1.0 - half) ** (power - 1)))
     law = at.law
-    on_q = grid.twice * (law.t1 * at.along)
-    both = grid.twice * (law.t2 * at.around) + on_q
-    reaction = test @ both + (slope @ on_q) * grid.dxi
+    reaction = []
+    for element, fall, rise in ((0, half, -1.0), (-1, 1.0 - half, 1.0)):
+        on_q = grid.twice[:, element] * law.t1[:, element] * at.along[:, element]
+        both = grid.twice[:, element] * law.t2[:, element] * at.around[:, element] + on_q
+        slope = 0.5 * power * rise * fall ** (power - 1)
+        reaction.append(fall**power @ both + (slope @ on_q) * grid.dxi[element])
     inner = np.exp(-problem.span)
-    horizontal = np.stack((-reaction[0] / (inner * inner), reaction[1]))
-    vertical = np.stack((lam / inner, lam))
-    pull = np.hypot(horizontal, vertical)  # sigma1 lp/l1: nominal stress, in units of G/lp
-    log1 = t.ends @ at.log[0]
+    pull = np.hypot(
+        np.stack((-reaction[0] / (inner * inner), reaction[1])), np.stack((lam / inner, lam))
+    )  # sigma1 lp/l1: the nominal stress, in units of G/lp
+    log1 = np.stack((t.ends[0] @ at.log[0][:, 0], t.ends[1] @ at.log[0][:, -1]))
     log2 = np.broadcast_to(problem.log_prestretch, log1.shape)
-    start = log1
-    for _ in range(3):
+    wrinkled = None
+    if state.relaxed is not None:
+        wrinkled = np.stack((state.relaxed[0, 0], state.relaxed[-1, -1]))
+        natural = np.stack((t.ends[0] @ at.log[1][:, 0], t.ends[1] @ at.log[1][:, -1]))
+        log2 = np.where(wrinkled, natural, log2)
+    start1, start2 = log1, log2
+    for n in range(4):
         now = stress(problem.film, stack(log1, log2))
+        if wrinkled is not None:
+            now = relax(problem.film, now, wrinkled)
+        if n == 3:
+            break
         factor = np.exp(problem.log_prestretch - log1)
-        step = (now.t1 * factor - pull) / ((now.h11 - now.t1) * factor)
-        log1 = log1 - step
-    good = np.abs(log1 - start) < 0.1 + 0.5 * np.abs(start - problem.log_prestretch)
-    log1 = np.where(good, log1, start)
-    now = stress(problem.film, stack(log1, log2))
-    return log1, now.t1, now.t2
+        step = (pull - now.t1 * factor) / ((now.h11 - now.t1) * factor)
+        log1 = log1 + step
+        if now.relief is not None:
+            log2 = log2 + now.relief.change + now.relief.rate * step
+    good = np.abs(log1 - start1) < 0.1 + 0.5 * np.abs(start1 - problem.log_prestretch)
+    if not good.all():
+        log1, log2 = np.where(good, log1, start1), np.where(good, log2, start2)
+        now = stress(problem.film, stack(log1, log2))
+        if wrinkled is not None:
+            now = relax(problem.film, now, wrinkled)
+    return Edges(log1, log2, now.t1, now.t2)
 
 
-def extremes(problem: Problem, grid: Grid, at: Points, lam: Array) -> Extremes:
-    """Extremes over the points and both edges."""
-    log1, t1, t2 = edges(problem, grid, at, lam)
-    area = np.concatenate((-at.log[2], log1 + problem.log_prestretch))
-    where = area.argmax(axis=0)
-    columns = np.arange(area.shape[1])
-    radii = np.concatenate((grid.radius, np.exp(-problem.span)[None], np.ones((1, area.shape[1]))))
+@lru_cache(maxsize=64)
+def _fine(modes: int) -> Array:
+    """Interpolation from the points to `FINE` points over the element, ends included."""
+    return barycentric(table(modes).xi, -np.cos(np.linspace(0.0, np.pi, FINE)))
+
+
+def _largest(grid: Grid, values: Array, ends: Array) -> tuple[Array, Array]:
+    """Largest value over the film and R/b where it is, from values at the points (Q, M, S) and both edges (2, S)."""
+    states = values.shape[2]
+    columns = np.arange(states)
+    edge = ends.argmax(axis=0)
+    best = ends[edge, columns]
+    radius = np.exp(grid.breaks[0]) ** (1 - edge)
+    inside = np.flatnonzero(values.max(axis=(0, 1)) > best)
+    if len(inside):
+        fine = np.einsum("fq,qms->mfs", _fine(grid.table.modes), values[..., inside])
+        flat = fine.reshape(-1, len(inside))
+        top = flat.argmax(axis=0)
+        element, place = np.divmod(top, FINE)
+        place = np.clip(place, 1, FINE - 2)
+        some = np.arange(len(inside))
+        low, mid, high = (fine[element, place + k, some] for k in (-1, 0, 1))
+        curve = low - 2.0 * mid + high
+        shift = np.where(curve < 0.0, np.clip(0.5 * (low - high) / curve, -1.0, 1.0), 0.0)
+        peak = np.maximum(flat[top, some], mid - 0.25 * (low - high) * shift)
+        better = peak > best[inside]
+        # The points are equidistant in the angle, so the parabola is laid in the angle too.
+        angle = (place + shift) * (np.pi / (FINE - 1))
+        x0, x1 = grid.breaks[element, inside], grid.breaks[element + 1, inside]
+        at = np.exp(x0 + 0.5 * (1.0 - np.cos(angle)) * (x1 - x0))
+        best[inside] = np.where(better, peak, best[inside])
+        radius[inside] = np.where(better, at, radius[inside])
+    return best, radius
+
+
+def extremes(problem: Problem, grid: Grid, state: State, at: Points, lam: Array) -> Extremes:
+    """Extremes over the points, between them, and at both edges."""
+    edge = edges(problem, grid, state, at, lam)
+    law = at.law
+    area, radius = _largest(grid, -at.log[2], edge.log1 + edge.log2)
+    if law.maxwell is None:
+        softening = np.zeros(len(lam))
+    else:
+        softening = (2.0 * law.maxwell / (law.h11 + 2.0 * law.maxwell)).max(axis=(0, 1))
     return Extremes(
-        log_area=area[where, columns],
-        radius=radii[where, columns],
-        hoop=np.minimum(at.law.t2.min(axis=0), t2.min(axis=0)),
-        meridional=np.minimum(at.law.t1.min(axis=0), t1.min(axis=0)),
-        log_stretch=np.maximum(np.maximum(at.log[:2].max(axis=(0, 1)), log1.max(axis=0)), problem.log_prestretch),
+        log_area=area,
+        radius=radius,
+        hoop=-_largest(grid, -law.t2, -edge.t2)[0],
+        meridional=-_largest(grid, -law.t1, -edge.t1)[0],
+        log_stretch=np.maximum(_largest(grid, at.log[0], edge.log1)[0], _largest(grid, at.log[1], edge.log2)[0]),
+        softening=softening,
     )
 
 
@@ -82,36 +152,44 @@ class Derivatives:
     span: Array
     height: Array
 
+    def take(self, index: Index) -> Derivatives:
+        return Derivatives(*(getattr(self, f.name)[..., index] for f in fields(self)))
+
 
 def derivatives(
-    problem: Problem, grid: Grid, w: Array, at: Points, lam: Array, tangent: tuple[Array, Array, Array]
+    problem: Problem, grid: Grid, state: State, at: Points, lam: Array, tangent: tuple[Array, Array, Array]
 ) -> Derivatives:
-    """Derivatives of the force from ``dF/dp = d/dh (dE/dp)``: one tangent, with respect to h, serves every p."""
+    """Derivatives of the force from ``dF/dp = d/dh (dE/dp)``: one tangent, with respect to h, serves every p.
+
+    A cut stays at its share of the span; the relaxed energy is smooth across it, so its motion changes nothing.
+    """
     tc, tw, stiffness = tangent
     film, law = problem.film, at.law
     te, tq = grid.strain(tc)
     d1 = at.along * tq + at.down * tw
-    d2 = at.around * te
+    around = at.around * te
+    d2 = (
+        around if state.relaxed is None or law.relief is None else np.where(state.relaxed, law.relief.rate * d1, around)
+    )
     w1, w2 = grid.twice * d1, grid.twice * d2
     w3 = -(w1 + w2)
     log = at.log
     rates = np.stack((w1, w2, w3))
     powers = film.powers(log)
-    mu = (powers * rates).sum(axis=(1, 2))
-    alpha = film.mu * ((powers + 1.0) * (log * rates)).sum(axis=(1, 2))
-    maxwell = 0.0 * lam if law.maxwell is None else (law.maxwell * w3).sum(axis=0)
-    prestretch = ((law.h11 + law.h12) * w1 + (law.h12 + law.h22) * w2).sum(axis=0)
+    mu = (powers * rates).sum(axis=(1, 2, 3))
+    alpha = film.mu * ((powers + 1.0) * (log * rates)).sum(axis=(1, 2, 3))
+    maxwell = np.zeros_like(lam) if law.maxwell is None else (law.maxwell * w3).sum(axis=(0, 1))
+    prestretch = ((law.h11 + law.h12) * w1 + (law.h12 + law.h22) * w2).sum(axis=(0, 1))
 
-    # With the span L: R = exp(-L (1 - xi)/2), dx = (L/2) dxi, de/dx = (2/L) de/dxi.
-    depth = 0.5 * (1.0 - grid.table.xi)[:, None]
+    # With the span L: R = exp(-L depth), dx = L d(depth), de/dx = (1/L) de/d(depth).
     per_span = 1.0 / problem.span
-    e_xi = (at.q - at.e) * per_span
-    te_xi = (tq - te) * per_span
+    depth = -np.log(grid.radius) * per_span
+    e_depth = (at.q - at.e) * per_span
+    te_depth = (tq - te) * per_span
     gp = law.t1 * at.along
-    slope = law.h11 - 2.0 * law.t1
-    dgp = slope * at.along * (at.along * tq + at.down * tw) + law.t1 / at.metric * tq + law.h12 * at.along * d2
+    dgp = (law.h11 - 2.0 * law.t1) * at.along * d1 + law.t1 / at.metric * tq + law.h12 * at.along * around
     span = (
-        grid.twice * ((per_span - 2.0 * depth) * (law.t1 * d1 + law.t2 * d2) - dgp * e_xi - gp * te_xi)
-        - grid.once * (per_span - depth) * (stiffness * w + lam * tw)
-    ).sum(axis=0)
+        grid.twice * ((per_span - 2.0 * depth) * (law.t1 * d1 + law.t2 * around) - dgp * e_depth - gp * te_depth)
+        - grid.once * (per_span - depth) * (stiffness * state.w + lam * tw)
+    ).sum(axis=(0, 1))
     return Derivatives(mu, alpha, maxwell, prestretch, span, stiffness)

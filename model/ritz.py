@@ -13,7 +13,11 @@ their points, so Newton eliminates them there by a division, and the system to f
 positive ``d2W*/dw2`` at every point (a stable film always has it) the reduced matrix is positive definite exactly
 when the state is stable under prescribed displacement.
 
-All arrays have the states along the last axis.
+The film may be cut into elements in x, each with modes of its own and a hat function at every cut: a wrinkled zone ends
+in a kink, and convergence is kept by putting a cut there. In a relaxed element the hoop stretch that makes the stress
+is not ``lp r/R`` but the natural one, an unknown of its point like the slope, and eliminated there in the same way.
+
+Arrays at points have the shape (Q, M, S): points of an element, elements, states. The states are always the last axis.
 """
 
 from __future__ import annotations
@@ -24,31 +28,31 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from model.law import Array, Film, Stress, stack, stress
+from model.law import Array, Film, Stress, relax, stack, stress
+
+Index = NDArray[np.intp] | NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Modes and quadrature on [-1, 1]: N modes, Q Gauss points."""
+    """Modes and quadrature on [-1, 1]: N modes and two hats, Q Gauss points."""
 
     modes: int
     points: int
     xi: Array  # (Q,)
     weight: Array  # (Q,)
-    phi: Array  # (Q, N)
-    dphi: Array  # (Q, N)
-    both: Array  # (2Q, N): phi over dphi
-    both_t: Array  # (N, 2Q): phi and dphi side by side, transposed
-    pairs: Array  # (N (N+1)/2, 3Q): products of modes for the Hessian
-    square: NDArray[np.intp]  # (N, N): where each entry of the matrix stands among the pairs
-    ends: Array  # (2, Q): barycentric extrapolation to xi = -1 and xi = 1
+    values: Array  # (2Q, N+2): functions over their derivatives; the last two are the hats, left and right
+    project: Array  # (N+2, 2Q): the same, functions and derivatives side by side, transposed
+    pairs: Array  # ((N+2)(N+3)/2, 3Q): products of functions for the Hessian
+    square: NDArray[np.intp]  # (N+2, N+2): where each entry of the matrix stands among the pairs
+    ends: Array  # (2, Q): extrapolation to xi = -1 and xi = 1
+    end_slopes: Array  # (2, Q): derivative there
 
 
 def barycentric(xi: Array, at: Array) -> Array:
-    """Matrix (len(at), len(xi)) of polynomial interpolation from Gauss-Legendre points ``xi`` to ``at``."""
-    n = len(xi)
-    _, weight = np.polynomial.legendre.leggauss(n)
-    lam = (-1.0) ** np.arange(n) * np.sqrt((1.0 - xi * xi) * weight)
+    """Matrix (len(at), len(xi)) of polynomial interpolation from the Gauss points ``xi`` to ``at``."""
+    _, weight = np.polynomial.legendre.leggauss(len(xi))
+    lam = (-1.0) ** np.arange(len(xi)) * np.sqrt((1.0 - xi * xi) * weight)
     gap = at[:, None] - xi[None, :]
     hit = gap == 0.0
     ratio = lam / np.where(hit, 1.0, gap)
@@ -59,79 +63,152 @@ def barycentric(xi: Array, at: Array) -> Array:
 
 
 @lru_cache(maxsize=64)
-def table(modes: int, points: int) -> Table:
-    """Tables for ``modes`` integrated Legendre modes and ``points`` Gauss points, made once."""
+def table(modes: int) -> Table:
+    """Tables for ``modes`` integrated Legendre modes, made once; four Gauss points more than modes."""
+    points = modes + 4
     xi, weight = np.polynomial.legendre.leggauss(points)
     k = np.arange(1, modes + 1).astype(np.float64)
-    legendre = np.polynomial.legendre.legvander(xi, modes + 1)
-    phi = (legendre[:, 2:] - legendre[:, :-2]) / np.sqrt(4.0 * k + 2.0)
-    dphi = (legendre[:, 1:-1] * np.sqrt(k + 0.5)).astype(np.float64, copy=False)
-    i, j = np.tril_indices(modes)
-    square = np.empty((modes, modes), dtype=np.intp)
+    legendre = np.polynomial.legendre.legvander(xi, points)
+    half = np.full(points, 0.5)
+    phi = np.column_stack(
+        ((legendre[:, 2 : modes + 2] - legendre[:, :modes]) / np.sqrt(4.0 * k + 2.0), half - 0.5 * xi, half + 0.5 * xi)
+    )
+    dphi = np.column_stack((legendre[:, 1 : modes + 1] * np.sqrt(k + 0.5), -half, half))
+    i, j = np.tril_indices(modes + 2)
+    square = np.empty((modes + 2, modes + 2), dtype=np.intp)
     square[i, j] = square[j, i] = np.arange(len(i))
     products = np.concatenate(
         (phi[:, i] * phi[:, j], phi[:, i] * dphi[:, j] + dphi[:, i] * phi[:, j], dphi[:, i] * dphi[:, j])
     )
+    # P_n'(+-1) = (+-1)^(n+1) n (n+1) / 2
+    n = np.arange(points).astype(np.float64)
+    slope = 0.5 * n * (n + 1.0)
+    to_legendre = (legendre[:, :points] * weight[:, None] * (n + 0.5)).T
+    end_slopes = np.stack(((-1.0) ** (n + 1.0) * slope, slope)) @ to_legendre
     return Table(
         modes=modes,
         points=points,
-        xi=xi,
-        weight=weight,
-        phi=phi,
-        dphi=dphi,
-        both=np.concatenate((phi, dphi)),
-        both_t=np.ascontiguousarray(np.concatenate((phi, dphi)).T),
+        xi=xi.astype(np.float64),
+        weight=weight.astype(np.float64),
+        values=np.concatenate((phi, dphi)),
+        project=np.ascontiguousarray(np.concatenate((phi, dphi)).T),
         pairs=np.ascontiguousarray(products.T),
         square=square,
         ends=barycentric(xi, np.array([-1.0, 1.0])),
+        end_slopes=end_slopes,
     )
 
 
 @lru_cache(maxsize=256)
 def transfer(old: int, new: int) -> Array:
-    """Matrix (new, old) that carries point values from ``old`` to ``new`` Gauss points."""
-    xi, _ = np.polynomial.legendre.leggauss(old)
-    at, _ = np.polynomial.legendre.leggauss(new)
-    return barycentric(xi, at)
+    """Matrix that carries point values from the points of ``old`` modes to those of ``new``."""
+    return barycentric(table(old).xi, table(new).xi)
+
+
+@lru_cache(maxsize=256)
+def places(modes: int, elements: int) -> NDArray[np.intp]:
+    """(M, N+2): the unknown that each function of each element belongs to; one past the last where there is none."""
+    out = np.empty((elements, modes + 2), dtype=np.intp)
+    out[:, :modes] = np.arange(elements * modes).reshape(elements, modes)
+    cuts = elements * modes + np.arange(elements - 1)
+    none = elements * modes + elements - 1
+    out[:, modes] = np.concatenate(([none], cuts))
+    out[:, modes + 1] = np.concatenate((cuts, [none]))
+    return out
 
 
 @dataclass(slots=True)
 class Grid:
-    """A table laid on the films' spans ``ln(b/a)``: radii and weights at the points, (Q, S)."""
+    """A table laid on the elements of the films: radii and weights at the points, (Q, M, S)."""
 
     table: Table
+    breaks: Array  # (M+1, S): ln(R/b) from -span to 0
     radius: Array  # R/b
     once: Array  # weight dx R
     twice: Array  # weight dx R^2
-    dxi: Array  # d(xi)/dx, (S,)
+    dxi: Array  # d(xi)/dx, (M, S)
 
     @classmethod
-    def lay(cls, modes: int, span: Array) -> Grid:
-        t = table(modes, modes + 4)
-        half = 0.5 * span
-        radius = np.exp((t.xi[:, None] - 1.0) * half)
-        once = radius * (t.weight[:, None] * half)
-        return cls(t, radius, once, once * radius, 1.0 / half)
+    def lay(cls, modes: int, breaks: Array) -> Grid:
+        t = table(modes)
+        half = 0.5 * (breaks[1:] - breaks[:-1])
+        radius = half * (t.xi[:, None, None] - 1.0)
+        radius += breaks[1:]
+        np.exp(radius, out=radius)
+        once = t.weight[:, None, None] * half
+        once *= radius
+        return cls(t, breaks, radius, once, once * radius, 1.0 / half)
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Grid:
-        return Grid(self.table, self.radius[:, index], self.once[:, index], self.twice[:, index], self.dxi[index])
+    @property
+    def elements(self) -> int:
+        return len(self.breaks) - 1
+
+    @property
+    def unknowns(self) -> int:
+        return self.elements * self.table.modes + self.elements - 1
+
+    def take(self, index: Index) -> Grid:
+        return Grid(
+            self.table,
+            self.breaks[:, index],
+            self.radius[..., index],
+            self.once[..., index],
+            self.twice[..., index],
+            self.dxi[:, index],
+        )
 
     def strain(self, c: Array) -> tuple[Array, Array]:
-        """``e = r/R - 1`` and ``q = dr/dR - 1`` at the points."""
-        q = self.table.points
-        values = self.table.both @ c
-        e = values[:q]
-        return e, values[q:] * self.dxi + e
+        """``e = r/R - 1`` and ``q = dr/dR - 1`` (less one, for a change) at the points, from the unknowns (n, S)."""
+        t = self.table
+        m, states = self.elements, c.shape[1]
+        if m == 1:
+            values = t.values[:, : t.modes] @ c
+        else:
+            padded = np.concatenate((c, np.zeros((1, states))))
+            local = padded[places(t.modes, m).T]  # (N+2, M, S)
+            values = t.values @ local.reshape(t.modes + 2, -1)
+        values = values.reshape(2, t.points, m, states)
+        e, q = values[0], values[1]
+        q *= self.dxi
+        q += e
+        return e, q
 
     def project(self, on_e: Array, on_q: Array) -> Array:
-        """``sum over points of on_e phi_k + on_q (phi_k + dphi_k/dx)`` for every mode k, (N, S)."""
-        return self.table.both_t @ np.concatenate((on_e + on_q, on_q * self.dxi))
+        """``sum over points of on_e phi + on_q (phi + dphi/dx)`` for every unknown, (n, S)."""
+        t = self.table
+        m, states = self.elements, on_e.shape[2]
+        stacked = np.empty((2, *on_e.shape))
+        np.add(on_e, on_q, out=stacked[0])
+        np.multiply(on_q, self.dxi, out=stacked[1])
+        if m == 1:
+            return t.project[: t.modes] @ stacked.reshape(2 * t.points, states)
+        local = (t.project @ stacked.reshape(2 * t.points, -1)).reshape(t.modes + 2, m, states)
+        out = np.zeros((self.unknowns + 1, states))
+        for element, place in enumerate(places(t.modes, m)):
+            out[place] += local[:, element]
+        return out[:-1]
 
     def matrix(self, ee: Array, eq: Array, qq: Array) -> Array:
-        """``sum over points of ee e_j e_k + eq (e_j q_k + q_j e_k) + qq q_j q_k``, (N, N, S)."""
-        mixed = (qq + eq) * self.dxi
-        stacked = np.concatenate((ee + eq + eq + qq, mixed, qq * (self.dxi * self.dxi)))
-        return (self.table.pairs @ stacked)[self.table.square]
+        """``sum over points of ee e e' + eq (e q' + q e') + qq q q'`` for every pair of unknowns, (n, n, S)."""
+        t = self.table
+        m, states = self.elements, ee.shape[2]
+        stacked = np.empty((3, *ee.shape))
+        sum_eq = stacked[1]
+        np.add(qq, eq, out=sum_eq)
+        np.add(ee, eq, out=stacked[0])
+        stacked[0] += sum_eq
+        sum_eq *= self.dxi
+        np.multiply(qq, self.dxi * self.dxi, out=stacked[2])
+        if m == 1:
+            n = t.modes
+            products = t.pairs[: n * (n + 1) // 2] @ stacked.reshape(3 * t.points, states)
+            return products[t.square[:n, :n]]
+        products = (t.pairs @ stacked.reshape(3 * t.points, -1)).reshape(-1, m, states)
+        local = products[t.square]  # (N+2, N+2, M, S)
+        out = np.zeros((self.unknowns + 1, self.unknowns + 1, states))
+        for element, place in enumerate(places(t.modes, m)):
+            out[np.ix_(place, place)] += local[:, :, element]
+        return out[:-1, :-1]
 
 
 @dataclass(slots=True)
@@ -143,73 +220,104 @@ class Problem:
     span: Array  # ln(b/a)
     height: Array  # h/b > 0
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Problem:
+    def take(self, index: Index) -> Problem:
         return Problem(self.film.take(index), self.log_prestretch[index], self.span[index], self.height[index])
+
+    def whole(self) -> Array:
+        """The breaks of one element over the whole film."""
+        return np.stack((-self.span, np.zeros_like(self.span)))
+
+
+@dataclass(slots=True)
+class State:
+    """Unknowns of a block of states."""
+
+    c: Array  # (n, S) modes and cuts
+    w: Array  # (Q, M, S) slopes
+    natural: Array | None = None  # (Q, M, S) natural ln(l2) where relaxed
+    relaxed: NDArray[np.bool_] | None = None  # (Q, M, S) where the hoop stress is relaxed to zero
+
+    def take(self, index: Index) -> State:
+        return State(
+            self.c[:, index],
+            self.w[..., index],
+            None if self.natural is None else self.natural[..., index],
+            None if self.relaxed is None else self.relaxed[..., index],
+        )
+
+    def put(self, index: Index, other: State) -> None:
+        self.c[:, index] = other.c
+        self.w[..., index] = other.w
+        if self.natural is not None and other.natural is not None:
+            self.natural[..., index] = other.natural
+        if self.relaxed is not None and other.relaxed is not None:
+            self.relaxed = self.relaxed.copy()  # often a view that repeats one row
+            self.relaxed[..., index] = other.relaxed
 
 
 @dataclass(slots=True)
 class Points:
-    """The state at the points: strains, stresses and what Newton needs, (Q, S) each."""
+    """The state at the points: strains, stresses and what Newton needs, (Q, M, S) each."""
 
     e: Array
     q: Array
-    log: Array  # (3, Q, S)
+    log: Array  # (3, Q, M, S): L1, the L2 that makes the stress, -(L1 + L2)
     law: Stress
     along: Array  # dL1/dp
     down: Array  # dL1/dw
     around: Array  # dL2/de
     metric: Array  # p^2 + w^2
+    hoop: Array  # ln(lp r/R), the same as log[1] but where relaxed
 
 
-def evaluate(problem: Problem, grid: Grid, c: Array, w: Array) -> Points:
-    """Strains, stresses and tangents of the state ``(c, w)``."""
-    e, q = grid.strain(c)
-    g = q * (q + 2.0)
-    g += w * w
+def evaluate(problem: Problem, grid: Grid, state: State) -> Points:
+    """Strains, stresses and tangents of ``state``."""
+    e, q = grid.strain(state.c)
+    g = q + 2.0
+    g *= q
+    g += state.w * state.w
     log1 = np.log1p(g)
     log1 *= 0.5
     log1 += problem.log_prestretch
-    log2 = np.log1p(e)
-    log2 += problem.log_prestretch
-    log = stack(log1, log2)
+    hoop = np.log1p(e)
+    hoop += problem.log_prestretch
+    if state.relaxed is None or state.natural is None:
+        log = stack(log1, hoop)
+        law = stress(problem.film, log)
+    else:
+        log = stack(log1, np.where(state.relaxed, state.natural, hoop))
+        law = relax(problem.film, stress(problem.film, log), state.relaxed)
     g += 1.0
     return Points(
-        e=e,
-        q=q,
-        log=log,
-        law=stress(problem.film, log),
-        along=(q + 1.0) / g,
-        down=w / g,
-        around=1.0 / (e + 1.0),
-        metric=g,
+        e=e, q=q, log=log, law=law, along=(q + 1.0) / g, down=state.w / g, around=1.0 / (e + 1.0), metric=g, hoop=hoop
     )
 
 
 @dataclass(slots=True)
 class Step:
-    """One Newton step: directions, the force it predicts, and what it says about the state."""
+    """One Newton step: the change of the state, the force after it, and whether the state is stable."""
 
-    dc: Array  # (N, S)
-    dw: Array  # (Q, S)
-    lam: Array  # (S,) force multiplier after the step
-    stable: NDArray[np.bool_]  # reduced matrix positive definite, d2W/dw2 > 0 everywhere
+    dc: Array  # (n, S)
+    dw: Array  # (Q, M, S)
+    lam: Array  # (S,)
+    stable: NDArray[np.bool_]
     tangent: tuple[Array, Array, Array] | None = None  # dc/dh, dw/dh, dlam/dh
 
 
 @dataclass(slots=True)
 class Reduced:
-    """What is left after the slopes are eliminated."""
+    """The Newton system after the slopes are eliminated."""
 
-    matrix: Array  # (N, N, S)
-    rhs: Array  # (N, S)
-    coupling: Array  # (N, S)
+    matrix: Array  # (n, n, S)
+    rhs: Array  # (n, S)
+    coupling: Array  # (n, S)
     give: Array  # (S,): d(h)/d(lam) at fixed c
-    lam0: Array
+    lam0: Array  # (S,)
     hw: Array
     kqw: Array
     kew: Array
     gw: Array
-    positive: NDArray[np.bool_]
+    positive: NDArray[np.bool_]  # (S,): d2W*/dw2 > 0 everywhere
 
 
 def reduce(problem: Problem, grid: Grid, w: Array, at: Points) -> Reduced:
@@ -226,44 +334,56 @@ def reduce(problem: Problem, grid: Grid, w: Array, at: Points) -> Reduced:
     kew = h12a * down
     gw = law.t1 * down
     thw = tm * hw
-    qq = (d / at.metric + tm) * thw  # K_qq - K_qw^2 / K_ww without the cancellation
+    d /= at.metric
+    d += tm
+    d *= thw  # K_qq - K_qw^2 / K_ww without the cancellation
     eq = h12a * along
     eq *= thw
     ee = law.h22 - law.t2
     ee *= around * around
-    ee -= kew * kew * hw
-    matrix = grid.matrix(grid.twice * ee, grid.twice * eq, grid.twice * qq)
-    hr = grid.once * hw
-    coupling = grid.project(hr * kew, hr * kqw)
+    hkew = hw * kew
+    ee -= kew * hkew
+    matrix = grid.matrix(grid.twice * ee, grid.twice * eq, grid.twice * d)
+    coupling = grid.project(grid.once * hkew, grid.once * (hw * kqw))
     hg = hw * gw
     residual = grid.project(grid.twice * (law.t2 * around - hg * kew), grid.twice * (law.t1 * along - hg * kqw))
-    give = (hr / grid.radius).sum(axis=0)
-    lam0 = (problem.height + (grid.once * (hg - w)).sum(axis=0)) / give
+    give = (grid.once * hw / grid.radius).sum(axis=(0, 1))
+    hg -= w
+    hg *= grid.once
+    lam0 = (problem.height + hg.sum(axis=(0, 1))) / give
     matrix += coupling[:, None] * (coupling / give)[None]
-    rhs = lam0 * coupling
-    rhs += residual
-    np.negative(rhs, out=rhs)
-    return Reduced(matrix, rhs, coupling, give, lam0, hw, kqw, kew, gw, kww.min(axis=0) > 0.0)
+    residual += lam0 * coupling
+    np.negative(residual, out=residual)
+    return Reduced(matrix, residual, coupling, give, lam0, hw, kqw, kew, gw, kww.min(axis=(0, 1)) > 0.0)
 
 
-FEW = 8  # below this many states one LAPACK call beats elimination vectorised over the states
+FEW = 8  # below this many states one LAPACK call a state beats elimination vectorised over the states
 
 
 def factor_solve(matrix: Array, rhs: list[Array]) -> tuple[list[Array], NDArray[np.bool_]]:
-    """Solve symmetric systems (N, N, S) for right-hand sides (N, S); also tell which matrices are positive definite."""
+    """Solve symmetric systems (n, n, S) for right-hand sides (n, S); tell which matrices are positive definite.
+
+    A matrix that is not positive definite gets a solution all the same when it is regular; nan when it is not.
+    """
     n, _, states = matrix.shape
     if states < FEW:
-        a = np.moveaxis(matrix, -1, 0)
-        b = np.stack(rhs, axis=-1).transpose(1, 0, 2)
-        try:
-            x: Array = np.linalg.solve(a, b).astype(np.float64, copy=False)
-        except np.linalg.LinAlgError:
-            x = np.full(b.shape, np.nan)
-        finite = np.isfinite(matrix).all(axis=(0, 1))
-        lowest = np.full(states, -1.0)
-        if finite.any():
-            lowest[finite] = np.linalg.eigvalsh(a[finite])[:, 0]
-        return [x[:, :, i].T for i in range(len(rhs))], lowest > 0.0
+        columns = np.stack(rhs, axis=1)
+        x = np.full(columns.shape, np.nan)
+        positive = np.zeros(states, dtype=bool)
+        for s in range(states):
+            a = matrix[:, :, s]
+            try:
+                lower = np.linalg.cholesky(a)
+            except np.linalg.LinAlgError:
+                try:
+                    x[:, :, s] = np.linalg.solve(a, columns[:, :, s])
+                except np.linalg.LinAlgError:
+                    continue
+            else:
+                inverse = np.linalg.inv(lower)
+                x[:, :, s] = inverse.T @ (inverse @ columns[:, :, s])
+                positive[s] = True
+        return [x[:, i] for i in range(len(rhs))], positive
     a = np.concatenate((matrix, np.stack(rhs, axis=1)), axis=1)
     positive = np.ones(states, dtype=bool)
     for k in range(n):
@@ -278,9 +398,9 @@ def factor_solve(matrix: Array, rhs: list[Array]) -> tuple[list[Array], NDArray[
     return [x[:, i] for i in range(len(rhs))], positive
 
 
-def newton(problem: Problem, grid: Grid, w: Array, at: Points, *, tangent: bool = False) -> Step:
-    """The Newton step at the state ``at``; with ``tangent`` also the derivative of the state with respect to h/b."""
-    system = reduce(problem, grid, w, at)
+def newton(problem: Problem, grid: Grid, state: State, at: Points, *, tangent: bool = False) -> Step:
+    """The Newton step at ``state``; with ``tangent`` also the derivative of the state with respect to h/b."""
+    system = reduce(problem, grid, state.w, at)
     rhs = [system.rhs]
     if tangent:
         rhs.append(-system.coupling / system.give)
@@ -288,7 +408,14 @@ def newton(problem: Problem, grid: Grid, w: Array, at: Points, *, tangent: bool 
 
     def slopes(dc: Array, lam: Array, gradient: Array | float) -> Array:
         de, dq = grid.strain(dc)
-        return system.hw * (lam / grid.radius - gradient - system.kqw * dq - system.kew * de)
+        out = lam / grid.radius
+        out -= gradient
+        dq *= system.kqw
+        out -= dq
+        de *= system.kew
+        out -= de
+        out *= system.hw
+        return out
 
     dc = solutions[0]
     lam = system.lam0 + (system.coupling * dc).sum(axis=0) / system.give
@@ -300,7 +427,7 @@ def newton(problem: Problem, grid: Grid, w: Array, at: Points, *, tangent: bool 
     return step
 
 
-def guess(problem: Problem, grid: Grid) -> tuple[Array, Array]:
+def guess(problem: Problem, grid: Grid) -> State:
     """A first state: r = R, and slopes that follow the power law ``w ~ R^(-1/n)`` of the film at its mean slope.
 
     ``R sigma1 w/(1+w^2) = const`` makes n the logarithmic derivative of that stress at the mean slope.
@@ -308,12 +435,11 @@ def guess(problem: Problem, grid: Grid) -> tuple[Array, Array]:
     mean = problem.height / -np.expm1(-problem.span)
     square = mean * mean
     log1 = 0.5 * np.log1p(square) + problem.log_prestretch
-    law = stress(problem.film, stack(log1[None], problem.log_prestretch[None]))
-    t1, h11 = law.t1[0], law.h11[0]
-    taut = t1 > 0.0
+    law = stress(problem.film, stack(log1, problem.log_prestretch))
+    t1, h11 = law.t1, law.h11
     part = square / (1.0 + square)
-    power = np.where(taut, 1.0 - 2.0 * part + part * h11 / np.where(taut, t1, 1.0), 1.0)
+    power = np.where(t1 > 0.0, 1.0 - 2.0 * part + part * h11 / t1, 1.0)
     power = np.where(power > 0.5, power, 1.0)
-    w = np.exp(-np.log(grid.radius) / power)
-    w *= problem.height / (grid.once * w).sum(axis=0)
-    return np.zeros((grid.table.modes, w.shape[1])), w
+    w = np.exp(np.log(grid.radius) / -power)
+    w *= problem.height / (grid.once * w).sum(axis=(0, 1))
+    return State(np.zeros((grid.unknowns, w.shape[2])), w)
