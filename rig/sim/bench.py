@@ -103,6 +103,10 @@ class SimulatedBench:
             case "displacement":
                 self.instruments[role] = KeyenceLKG(s.displacement, self.world, wire, self._rng(role))
 
+    def prepare(self) -> None:
+        """Do now what takes long (the film's table), so that nothing waits for it later."""
+        _ = self.world.film
+
     def wire(self, role: str) -> ByteWire | FrameWire:
         """The wire to the instrument of ``role``; the host uses its ``host_write`` and ``host_read``."""
         return self._frames[role] if role in self._frames else self._bytes[role]

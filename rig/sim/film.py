@@ -24,9 +24,11 @@ Bools = npt.NDArray[np.bool_]
 # (specimen, disk displacement, voltage) -> (force, peak field, solution found), arrays of one shape
 Solve = Callable[[Specimen, Floats, Floats], tuple[Floats, Floats, Bools]]
 
-TOLERANCE = 5e-6  # interpolation error aimed at, of the largest force in the table
+TOLERANCE = 1e-5  # interpolation error aimed at, of the largest force in the table
 WORST = 1e-3  # above this no table is made
-SIZES = ((14, 6), (20, 8), (28, 12), (40, 18))
+SIZES = ((20, 8), (30, 12), (44, 18))
+BREAKDOWN_SIZE = 20
+BREAKDOWN_TOLERANCE = 1e-4
 BOUND_DEGREE = 5
 DEFAULT_FIELD = 80e6  # V/m, where the material names no breakdown field
 REACH = 1.25  # largest indentation, in widths of the annulus; beyond it the film tears
@@ -118,15 +120,21 @@ class FilmTable:
 
 def tabulate(specimen: Specimen, compliance: float, with_voltage: bool, solve: Solve = solve_membrane) -> FilmTable:
     """Make the table for ``specimen`` on a rig of ``compliance`` (m/N): s = displacement + compliance x force."""
-    best: FilmTable | None = None
+    reach = REACH * (specimen.ring_radius - specimen.disk_radius)
+    empty = FilmTable(reach, np.inf, np.zeros((1, 1)), None, None)
+    if with_voltage:
+        w = _nodes(BREAKDOWN_SIZE)
+        at_nodes = _breakdown(specimen, reach * np.sqrt(w), solve)
+        fit = np.polynomial.Chebyshev.fit(w, at_nodes, BOUND_DEGREE, domain=(0.0, 1.0))
+        bound = np.asarray(fit.coef, dtype=np.float64) * float(np.max(at_nodes / fit(w)))
+        empty = replace(empty, _bound=bound, _breakdown=_coefficients(at_nodes))
+    best = empty
     for n_w, n_u in SIZES:
-        table = _fit(specimen, compliance, n_w, n_u if with_voltage else 1, solve)
-        if best is None or table.error < best.error:
-            best = table
-        largest = float(best.force(np.array([best.reach]))[0])
+        table = _fit(specimen, compliance, empty, n_w, n_u if with_voltage else 1, solve)
+        best = min(best, table, key=lambda one: one.error)
+        largest = float(best.force(np.array([reach]))[0])
         if best.error <= TOLERANCE * largest:
             return best
-    assert best is not None
     if not best.error <= WORST * largest:
         raise FilmTableError(
             f"the film of specimen {specimen.name!r} cannot be tabulated: the interpolation is wrong by up to"
@@ -135,43 +143,36 @@ def tabulate(specimen: Specimen, compliance: float, with_voltage: bool, solve: S
     return best
 
 
-def _fit(specimen: Specimen, compliance: float, n_w: int, n_u: int, solve: Solve) -> FilmTable:
-    reach = REACH * (specimen.ring_radius - specimen.disk_radius)
-    h = reach * np.sqrt(_nodes(n_w))
-    bound: Floats | None = None
-    breakdown: Floats | None = None
-    voltage = np.zeros((n_w, 1))
-    if n_u > 1:
-        w = _nodes(n_w)
-        at_nodes = _breakdown(specimen, h, solve)
-        breakdown = _coefficients(at_nodes)
-        fit = np.polynomial.Chebyshev.fit(w, at_nodes, BOUND_DEGREE, domain=(0.0, 1.0))
-        bound = np.asarray(fit.coef, dtype=np.float64) * float(np.max(at_nodes / fit(w)))
-        voltage = _clenshaw(bound, w)[:, None] * np.sqrt(_nodes(n_u))
-    force, _, found = solve(specimen, np.broadcast_to(h[:, None], voltage.shape), voltage)
-    if not found.all():
-        i, j = np.argwhere(~found)[0]
-        raise FilmTableError(f"no membrane solution for the film at {h[i] * 1e3:.4g} mm and {voltage[i, j]:.4g} V")
-    table = FilmTable(reach, 0.0, _coefficients(_coefficients(force / h[:, None]).T).T, bound, breakdown)
-    if compliance > 0:
-        table = _on_rig(table, compliance, h, n_u)
-    return replace(table, error=_check(specimen, table, compliance, n_w, n_u, solve))
-
-
 def _breakdown(specimen: Specimen, h: Floats, solve: Solve) -> Floats:
     """Voltage at which the film breaks down at the displacements ``h``: by its field, or by losing stability first."""
     strength = specimen.material.breakdown_field or DEFAULT_FIELD
     for _ in range(12):
         voltage = np.ones_like(h)
-        for _ in range(12):
+        for _ in range(20):
             _, field, found = solve(specimen, h, voltage)
-            voltage = np.where(field > 0, voltage * strength / np.where(field > 0, field, 1.0), voltage)
             if not found.all():
                 break
-        else:
-            return voltage
+            ratio = np.where(field > 0, strength / np.where(field > 0, field, 1.0), 1.0)
+            voltage = voltage * ratio
+            if np.abs(ratio - 1.0).max() < BREAKDOWN_TOLERANCE:
+                return voltage
         strength *= 0.9
-    raise FilmTableError(f"the film of specimen {specimen.name!r} is unstable at any voltage")
+    raise FilmTableError(f"the film of specimen {specimen.name!r} has no stable state below its breakdown")
+
+
+def _fit(specimen: Specimen, compliance: float, empty: FilmTable, n_w: int, n_u: int, solve: Solve) -> FilmTable:
+    h = empty.reach * np.sqrt(_nodes(n_w))
+    voltage = np.zeros((n_w, 1))
+    if n_u > 1:
+        voltage = empty.bound(h)[:, None] * np.sqrt(_nodes(n_u))
+    force, _, found = solve(specimen, np.broadcast_to(h[:, None], voltage.shape), voltage)
+    if not found.all():
+        i, j = np.argwhere(~found)[0]
+        raise FilmTableError(f"no membrane solution for the film at {h[i] * 1e3:.4g} mm and {voltage[i, j]:.4g} V")
+    table = replace(empty, _force=_coefficients(_coefficients(force / h[:, None]).T).T)
+    if compliance > 0:
+        table = _on_rig(table, compliance, h, n_u)
+    return replace(table, error=_check(specimen, table, compliance, n_w, n_u, solve))
 
 
 def _on_rig(table: FilmTable, compliance: float, s: Floats, n_u: int) -> FilmTable:

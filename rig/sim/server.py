@@ -102,6 +102,7 @@ class Server:
         self._bench = bench
         self._clock = clock
         self._ports: dict[str, _Port] = {}
+        bench.prepare()
         try:
             for role in bench.instruments:
                 wire = bench.wire(role)
