@@ -11,9 +11,11 @@ value yet. ``TG,a,+01.2345`` may be pushed at any time.
 **What corruption cannot be seen.** There is neither checksum nor message number. A digit that has turned into another
 digit, or a sign that has flipped, is a valid value as long as it stays within ``limit_mm``; so is a refusal whose code
 has changed. Every other change of a single byte, and every lost or added one, makes a line that fits the grammar or
-the question no longer, and it is dropped and counted. Because two answers to the same command look alike, the driver
-asks for ``M1`` and ``M0`` in turn: a duplicated answer, or one that arrives after its question was given up, meets the
-other question and is dropped. Only an answer that is late by two questions would be taken for a new one.
+the question no longer, and it is dropped and counted.
+
+Two answers to the same command look alike, too. So the driver asks for ``M1`` and ``M0`` in turn, and a duplicated
+answer meets the other question and is dropped. When an answer does not come in time, it asks for the program number,
+``PR``, before it asks for a value again: answers keep their order, so that after this one no old value can come.
 
 Source: Keyence LK-G series user's manual, RS-232C communication; settings as used by DESY (cmstkmodlab).
 """
@@ -29,7 +31,7 @@ from dataclasses import dataclass
 from typing import NoReturn, TypeVar
 
 from drivers.dialogue import Answer, Ask, Dialogue, Schedule, Script, label
-from drivers.link import ByteLink, DeviceError, DeviceRefused
+from drivers.link import ByteLink, DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import OK, DisplacementSample, Identity, SampleFlag
 
 T = TypeVar("T")
@@ -55,6 +57,8 @@ LONGEST_SETTLING_S = 10.0
 """How long set-up waits for the first value; a specimen that the head cannot see never gives one."""
 
 SETTLING_LOOK_S = 0.01
+
+MEASURE_TRIES = 3
 
 _MEASURE = "value"
 _MAX_LINE = 128
@@ -368,15 +372,25 @@ class KeyenceLKG:
 
     def _value(self, delay_s: float = 0.0) -> _Part[tuple[float, Value]]:
         """One value of our OUT, with its time."""
-        answer = yield Ask(_MEASURE, delay_s=delay_s)
+        answer = yield from self._measured(delay_s)
         if isinstance(answer.message, Refused) and answer.message.code == 1:
             self.counters["mode_restored"] += 1
             yield from self._enter("R0")
-            answer = yield Ask(_MEASURE)
+            answer = yield from self._measured()
         if isinstance(answer.message, Refused):
             self._refuse("to measure", answer.message)
         assert isinstance(answer.message, Measured)
         return answer.t, answer.message.values[self._output]
+
+    def _measured(self, delay_s: float = 0.0) -> _Part[Answer[Message]]:
+        for _ in range(MEASURE_TRIES - 1):
+            try:
+                return (yield Ask(_MEASURE, repeat=False, delay_s=delay_s))
+            except DeviceSilent:
+                # The answer may still come. Answers keep their order: after that to PR there is no old value left.
+                self.counters["retries"] += 1
+                yield Ask("PR")
+        return (yield Ask(_MEASURE, repeat=False))
 
     def _refuse(self, command: str, refused: Refused) -> NoReturn:
         why, advice = ERRORS.get(refused.code, ("of an error that this driver does not know", ""))
