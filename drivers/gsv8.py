@@ -441,11 +441,16 @@ class GSV8:
         self, command: int, parameters: bytes = b"", lengths: tuple[int, ...] = (0,), delay_s: float = 0
     ) -> Generator[_Step, _Got, Reply]:
         """One request; refused answers are returned like others."""
+        message = yield from self._exchange(_Request(command, parameters, lengths), delay_s)
+        assert isinstance(message, Reply)
+        return message
+
+    def _exchange(self, request: _Request, delay_s: float = 0) -> Generator[_Step, _Got, Message]:
+        delay_s, self._settle_s = max(delay_s, self._settle_s), self._timeout  # in case this one goes wrong
         retries = self.counters["retries"]
-        request = _Request(command, parameters, lengths)
-        answer = yield Ask(request, delay_s=max(delay_s, self._settle_s))
-        self._settle_s = self._timeout if self.counters["retries"] > retries else 0.0
-        assert isinstance(answer.message, Reply)
+        answer = yield Ask(request, delay_s=delay_s)
+        if self.counters["retries"] == retries:
+            self._settle_s = 0.0
         return answer.message
 
     def _demand(
@@ -529,10 +534,7 @@ class GSV8:
 
     def _check_frame(self) -> Generator[_Step, _Got, None]:
         """One measured frame on request: it shows type and number of channels, and the stream is held to them."""
-        retries = self.counters["retries"]
-        answer = yield Ask(_Request(GET_VALUE), delay_s=self._settle_s)
-        self._settle_s = self._timeout if self.counters["retries"] > retries else 0.0
-        frame = answer.message
+        frame = yield from self._exchange(_Request(GET_VALUE))
         if isinstance(frame, Reply):
             raise DeviceRefused(self.name, f"GetValue refused: {frame.meaning}", "Check the sensor and its cable.")
         if frame.type != self._frame_type:
