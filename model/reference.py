@@ -38,7 +38,8 @@ Array = NDArray[np.float64]
 FINE_ORDER = 28
 COARSE_ORDER = 12
 FINE_TOLERANCE = 1e-18  # of the first neglected term of a series
-COARSE_TOLERANCE = 1e-9
+COARSE_TOLERANCE = 1e-5
+MAX_LEGS = 80  # tries of the continuation
 SAMPLES = 12  # points of a step where extremes and changes of zone are looked for
 
 
@@ -96,7 +97,8 @@ def reference(
     """Solve one state for each specimen, displacement (m, positive) and voltage (V); the three are broadcast together.
 
     ``wrinkling`` is ``"plain"`` (the equations of Cao & Conn 2018, whatever the sign of the hoop stress) or
-    ``"tension_field"``. Force and extremes are good to about 1e-12 relative where ``converged`` is set.
+    ``"tension_field"``. Force and extremes are good to about 1e-12 relative where ``converged`` is set. Where hoop
+    tension is lost the plain equations have answers that no film has: what is given then is the branch that leads there.
     """
     if wrinkling not in ("plain", "tension_field"):
         raise ValueError(f'wrinkling is "{wrinkling}"; allowed are "plain" and "tension_field"')
@@ -181,13 +183,14 @@ def _continue(target: _States) -> tuple[Array, NDArray[np.bool_]]:
     everyone = np.arange(count)
     current = np.stack([np.log(helped), np.log(start / spread)])
     progress = np.zeros(count)
-    current, solved = _newton(at(everyone, progress), current, COARSE_ORDER, COARSE_TOLERANCE, 1e-6, 20)
+    current, solved, upright = _newton(at(everyone, progress), current, COARSE_ORDER, COARSE_TOLERANCE, 1e-4, 20)
     previous, previous_progress = current.copy(), progress.copy()
     leg_lengths = [np.log(target.height / start), np.ones(count), np.ones(count)]
     skip = [np.zeros(count, bool), helped <= target.log_prestretch, target.electric == 0.0]
     step = np.minimum(0.5, 1.0 / leg_lengths[0])
+    growth = np.full(count, 2.0)
     alive = solved.copy()
-    while True:
+    for _ in range(MAX_LEGS):
         active = np.flatnonzero(alive & (progress < 3.0))
         if active.size == 0:
             break
@@ -203,26 +206,33 @@ def _continue(target: _States) -> tuple[Array, NDArray[np.bool_]]:
         travelled = progress[active] - previous_progress[active]
         ratio = np.where(travelled > 0, (aim - progress[active]) / np.where(travelled > 0, travelled, 1.0), 0.0)
         guess = current[:, active] + ratio * (current[:, active] - previous[:, active])
-        found, good = _newton(at(active, aim), guess, COARSE_ORDER, COARSE_TOLERANCE, 1e-6, 6)
-        good &= np.max(np.abs(found - guess), axis=0) < 0.7
+        found, good, side = _newton(at(active, aim), guess, COARSE_ORDER, COARSE_TOLERANCE, 1e-4, 5)
+        # A fold of the branch, or a leap over one, changes the sign of the determinant.
+        good &= (np.max(np.abs(found - guess), axis=0) < 0.5) & (side == upright[active])
         moved, held = active[good], active[~good]
         previous[:, moved], previous_progress[moved] = current[:, moved], progress[moved]
         current[:, moved], progress[moved] = found[:, good], aim[good]
-        step[moved] *= 2.0
+        step[moved] *= growth[moved]
+        growth[moved] = np.minimum(2.0, 1.3 * growth[moved])
         step[held] *= 0.3
+        growth[held] = 1.0  # where it has just failed, do not ask for more at once
         crossed = moved[progress[moved] >= leg[good] + 1.0]
         previous_progress[crossed] = progress[crossed]  # a new direction: the last step predicts nothing
         step[crossed] = 0.35
         alive[step < 1e-3] = False
     done = alive & (progress >= 3.0)
-    final, good = _newton(target, current, FINE_ORDER, FINE_TOLERANCE, 1e-13, 12)
-    return final, done & good
+    final, good, side = _newton(target, current, FINE_ORDER, FINE_TOLERANCE, 1e-13, 12)
+    return final, done & good & (side == upright)
 
 
 def _newton(
     states: _States, guess: Array, order: int, series_tolerance: float, tolerance: float, limit: int
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Newton's method on the two conditions at the ring; steps of ``tolerance`` or less end it."""
+) -> tuple[Array, NDArray[np.bool_], Array]:
+    """Newton's method on the two conditions at the ring; steps of ``tolerance`` or less end it.
+
+    Also returned is the sign of the Jacobian's determinant, which a fold of the branch changes.
+    """
+    orientation = np.zeros(states.size)
     unknowns = guess.copy()
     good = np.zeros(states.size, bool)
     pending = np.arange(states.size)
@@ -243,6 +253,7 @@ def _newton(
         j21, j22 = (rise[1] - rise[0]) / delta, (rise[2] - rise[0]) / delta
         det = j11 * j22 - j12 * j21
         change = np.stack([-(j22 * hoop[0] - j12 * rise[0]), -(j11 * rise[0] - j21 * hoop[0])]) / det
+        orientation[pending] = np.sign(det)
         size = np.max(np.abs(change), axis=0)
         lost = ~np.isfinite(size)
         change *= np.minimum(1.0, 1.5 / np.where(lost, 1.0, np.maximum(size, 1e-300)))
@@ -255,7 +266,7 @@ def _newton(
         pending = pending[~ended & ~lost]
         if pending.size == 0:
             break
-    return unknowns, good
+    return unknowns, good, orientation
 
 
 # ---- one integration from the disk to the ring
@@ -306,8 +317,8 @@ def _integrate(
     pull_at_disk = np.exp(x) * s1 * np.exp(-e1) * np.sin(theta)
     peak, low1, low2 = e1 + natural, s1.copy(), np.where(wrinkled, 0.0, s2)
     widest = np.maximum(e1, e2)
-    running = np.arange(count)
-    for _ in range(10 * order):  # a state whose steps shrink runs into a singularity: no state
+    running = np.flatnonzero(s1 > 0)
+    for _ in range(8 * order):  # a state whose steps shrink runs into a singularity: no state
         part = states.take(running)
         position = np.stack([e1, e2, natural, theta, drop])[:, running]
         zone = wrinkled[running]
@@ -349,7 +360,8 @@ def _integrate(
             wrinkled[running] = zone ^ changed
             ever |= wrinkled
             natural[running] = np.where(wrinkled[running], natural[running], e2[running])
-        alive = np.isfinite(e1[running]) & np.isfinite(theta[running]) & (length > 0)
+        tension, _ = _stresses(part, e1[running], natural[running])
+        alive = (tension > 0) & np.isfinite(theta[running]) & (length > 0)
         running = running[alive & ~last]
         if running.size == 0:
             break

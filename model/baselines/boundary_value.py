@@ -54,7 +54,8 @@ def boundary_value(
             return failed(f"solve_bvp: {problem}", count)
         if not found.success:
             return failed(f"solve_bvp: {found.message}", count)
-        y = found.sol(np.linspace(x[0], x[-1], PROFILE))
+        even = np.linspace(np.log(film.disk), 0.0, PROFILE)
+        y = found.sol(even if logarithmic else np.clip(np.exp(even), film.disk, 1.0))
         s1, _ = film.stresses(y[0, :1], y[1, :1])
         pull = film.disk * float(s1[0] / y[0, 0] * np.sin(y[2, 0]))
         return film.answer(pull, y[0], y[1], count)

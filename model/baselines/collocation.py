@@ -70,8 +70,11 @@ def collocation(
                 return failed(f"Newton's method does not converge on {n + 1} points", evaluations)
             pull, l1, l2 = _read(film, shape, n, coordinate)
             if abs(pull - last) <= tolerance * abs(pull):
-                even = interpolate(np.stack([l1, l2]), np.linspace(-1.0, 1.0, PROFILE))
-                return film.answer(pull, even[0], even[1], evaluations)
+                even = np.linspace(-1.0, 1.0, PROFILE)  # of ln R
+                if coordinate == "R":
+                    even = 2.0 * (np.exp(0.5 * np.log(film.disk) * (1.0 - even)) - film.disk) / (1.0 - film.disk) - 1.0
+                l1, l2 = interpolate(np.stack([l1, l2]), np.clip(even, -1.0, 1.0))
+                return film.answer(pull, l1, l2, evaluations)
             last = pull
     return failed(f"{COUNTS[-1] + 1} points do not reach the tolerance", evaluations)
 

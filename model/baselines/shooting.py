@@ -107,7 +107,9 @@ def _shoot(
     start: tuple[float, ...] | None,
 ) -> Result:
     """Correct (l1, theta) at the disk with MINPACK's hybr; ``integrate`` returns (miss, l1, l2)."""
-    from scipy.optimize import root
+    import scipy.optimize
+
+    root: Any = scipy.optimize.root
 
     def miss(unknowns: Array) -> Array:
         try:
@@ -115,12 +117,18 @@ def _shoot(
         except (OutOfDomain, ArithmeticError, ValueError):
             return np.array([1e3, 1e3])
 
-    guess = np.array(start if start is not None else film.cone())
-    found = root(miss, guess, method="hybr", tol=max(tolerance, 1e-13), options={"eps": max(tolerance, 1e-14)})
-    l1, theta = (float(u) for u in found.x)
-    # hybr may stop for lack of progress when it is as near as the integrator lets it be: judge by the miss.
-    if not float(np.max(np.abs(found.fun))) <= max(100 * tolerance, 1e-11) * max(1.0, film.height):
+    # A cone; failing that, a slope at the disk and a stretch as a small disk makes them.
+    stretch, slope = film.cone()
+    guesses = [start] if start is not None else [(stretch, slope), (stretch**1.5, 0.5 * (slope + 0.5 * math.pi))]
+    for guess in guesses:
+        options = {"eps": max(tolerance, 1e-14)}
+        found = root(miss, np.array(guess), method="hybr", tol=max(tolerance, 1e-13), options=options)
+        # hybr may stop for lack of progress when it is as near as the integrator lets it be: judge by the miss.
+        if float(np.max(np.abs(found.fun))) <= max(100 * tolerance, 1e-11) * max(1.0, film.height):
+            break
+    else:
         return failed(f"shooting does not meet the ring: {found.message}", equations.evaluations)
+    l1, theta = (float(u) for u in found.x)
     at = np.linspace(math.log(film.disk), 0.0, PROFILE)
     try:
         _, meridional, hoop = integrate(l1, theta, at)

@@ -114,11 +114,17 @@ def test_a_disk_small_as_a_needle_still_balances(ratio: float) -> None:
     assert found.closure.max() < 1e-13
 
 
-def test_a_state_beyond_pull_in_is_not_given_a_number() -> None:
-    found = reference(film(), [10e-3, 10e-3], [0.0, 1e5])
-    assert found.converged.tolist() == [True, False]
-    assert np.isnan(found.force[1])
+def test_a_state_without_tension_is_not_given_a_number() -> None:
+    found = reference(film(), 10e-3, [0.0, 3e3, 1e5], wrinkling="tension_field")
+    assert found.converged.tolist() == [True, False, False]
+    assert np.isnan(found.force[1:]).all()
     assert np.isfinite(found.force[0])
+
+
+def test_the_neighbours_of_a_state_in_a_call_do_not_change_it() -> None:
+    alone = reference(film(2), 8e-3, 900.0)
+    among = reference([film(4, 1.0), film(2), film(8, 1.3)], [1e-3, 8e-3, 20e-3], [0.0, 900.0, 3e3])
+    np.testing.assert_allclose(among.force[1], alone.force[0], rtol=1e-14)
 
 
 @pytest.mark.parametrize("wrinkled", [False, True])
