@@ -160,7 +160,10 @@ class SimulatedBench:
             raise ValueError(f"there is no {fault.role} on this bench to go wrong")
         self._injected += 1
         begin = max(fault.at_s, self.now)
-        heapq.heappush(self._due, (begin, 2 * self._injected, True, fault))
+        if begin > self.now:
+            heapq.heappush(self._due, (begin, 2 * self._injected, True, fault))
+        else:
+            self._switch(fault, 2 * self._injected, True, self.now)
         if fault.duration_s is not None:
             heapq.heappush(self._due, (begin + fault.duration_s, 2 * self._injected + 1, False, fault))
 

@@ -30,7 +30,7 @@ FLAGS = (
     *("NC", "NI", "ND", "NR", "NT", "NU", "NJ"),
 )
 
-COMMAND = re.compile(rb"^/(?P<body>[^:]*)(?::(?P<check>[0-9A-Fa-f]{2}))?$")
+COMMAND = re.compile(rb"^/(?P<body>[^:]*)(?::(?P<check>[0-9A-F]{2}))?$")
 
 
 def checksum(body: bytes) -> bytes:
@@ -169,7 +169,7 @@ class ZaberStage:
         if match is None:
             return
         body, check = match["body"], match["check"]
-        if check is not None and checksum(body) != check.upper():
+        if check is not None and checksum(body) != check:
             return
         words = body.decode("ascii").split()
         numbers: list[str] = []
