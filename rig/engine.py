@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from drivers.link import DeviceError
-from drivers.roles import HVSample, Sample
+from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample
 from rig.actions import carry_out, film_checked
 from rig.bench import Bench
 from rig.errors import ConfigError, FaultError, LimitError, RigError, Stopped
 from rig.plan import Action
 from rig.recorder import Gains, Recorder
-from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
+from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState, flag_names
 from rig.safety.limits import FilmLimits, Limits
 from rig.signals import StopRequest
 
@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
 SETUP_LIMIT_S = 15.0
 SILENCE_PERIODS = 10.0  # a sensor silent for this many periods, and longer than two of its time-outs, is a fault
+BAD_SAMPLES = 3  # this many samples in a row that the sensor itself calls bad are a fault
+FROZEN_SAMPLES = 25  # this many equal force readings in a row: an amplifier's last digits are never so quiet
+DISAGREEMENT_M = 0.5e-3  # between laser and stage, besides what the stage moves in DISAGREEMENT_LAG_S ...
+DISAGREEMENT_LAG_S = 0.05
+DISAGREEMENT_S = 0.25  # ... and for longer than this: one of the two is frozen, or the pusher has slipped
 FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
 SAFE_LIMIT_S = 60.0  # a ramp down takes as long as it takes; after this the output is called NOT SAFE
 
@@ -114,6 +119,10 @@ class Engine:
         self._started = self.clock.now()
         self._last_sample: dict[str, float] = {}
         self._silence: dict[str, float] = {}
+        self._bad_samples: dict[str, int] = {}
+        self._last_force = math.nan
+        self._equal_forces = 0
+        self._agreed = -math.inf
         self._next_film_check = 0.0
         self._next_progress = 0.0
         self._watching = False
@@ -253,10 +262,26 @@ class Engine:
     def _take(self, role: str, sample: Sample, now: float) -> None:
         self.recorder.add(sample)
         self._last_sample[role] = now
+        if isinstance(sample, ForceSample | DisplacementSample):
+            self._judge(role, sample)
+        if isinstance(sample, ForceSample):
+            self._judge_frozen(sample)
         if self.listener is not None:
             self.listener(sample)
         if isinstance(sample, HVSample) and self._guard is not None:
             self._guard.on_sample(sample)
+
+    def _judge(self, role: str, sample: ForceSample | DisplacementSample) -> None:
+        """A sensor may call single samples bad, but not several in a row: then nobody knows where the film is."""
+        self._bad_samples[role] = self._bad_samples.get(role, 0) + 1 if sample.flags else 0
+        if self._watching and self._bad_samples[role] >= BAD_SAMPLES:
+            raise FaultError(f"{role}: {BAD_SAMPLES} samples in a row are bad ({flag_names(sample.flags)}).")
+
+    def _judge_frozen(self, sample: ForceSample) -> None:
+        self._equal_forces = self._equal_forces + 1 if sample.reading == self._last_force else 0
+        self._last_force = sample.reading
+        if self._watching and self._equal_forces >= FROZEN_SAMPLES:
+            raise FaultError(f"force: {FROZEN_SAMPLES} equal readings in a row; the sensor is frozen.")
 
     def _watch(self, now: float) -> None:
         """Hold what was measured against the limits, and the age of every sensor against its rate."""
@@ -269,11 +294,27 @@ class Engine:
             self.limits.force.check(recorder.force, "Force measured")
         if math.isfinite(recorder.contact):
             self.limits.displacement.check(recorder.displacement, "Displacement measured")
+            self._compare_stage_and_laser(now)
             live = self._guard is not None and self._guard.state is GuardState.LIVE
             if live and now >= self._next_film_check:
                 self._next_film_check = now + FILM_CHECK_S
                 voltage = recorder.hv.voltage if recorder.hv is not None else math.nan
                 self.film.check(recorder.displacement, max(voltage, 0.0), "Film, as measured")
+
+    def _compare_stage_and_laser(self, now: float) -> None:
+        """Beyond contact the disk goes with the stage; if they part, one of the two sensors does not tell the truth."""
+        recorder = self.recorder
+        if not recorder.has_laser or recorder.stage is None:
+            return
+        by_stage = recorder.stage.position - recorder.contact
+        allowed = DISAGREEMENT_M + DISAGREEMENT_LAG_S * self.limits.speed.high
+        if by_stage < 0 or abs(by_stage - recorder.displacement) <= allowed:
+            self._agreed = now
+        elif now - self._agreed > DISAGREEMENT_S:
+            raise FaultError(
+                f"stage and laser disagree beyond contact: {by_stage * 1e3:.2f} against {recorder.displacement * 1e3:.2f} mm. "
+                "One of them is frozen, or the pusher has slipped."
+            )
 
     def _allowed_silence(self) -> dict[str, float]:
         """Seconds without a sample after which a device counts as silent."""

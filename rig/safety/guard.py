@@ -8,21 +8,23 @@ supply's own current limit and the bleed resistor are.
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Callable
+from enum import Enum, Flag
 
 from drivers.roles import HVFlag, HVSample, HVSupply
 from rig.errors import FaultError, LimitError
 from rig.safety.limits import FilmLimits, Limits
 
 SAFE_VOLTAGE = 60.0  # V; below this the discharge is harmless (EN 50191 names 60 V DC)
+SAG_V, SAG_PART = 50.0, 0.05  # a settled output this far below its set-point, in SAG_SAMPLES in a row, has sagged
+SAG_SAMPLES = 2
 SAFE_SAMPLES = 2  # consecutive measured voltages below SAFE_VOLTAGE before we call the output safe
 
 TRIP = HVFlag.TRIPPED | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.INTERLOCK_OPEN | HVFlag.ARC | HVFlag.FAULT
 
 
-class GuardState(enum.Enum):
+class GuardState(Enum):
     """Where the latch stands."""
 
     SAFE = "safe"
@@ -61,6 +63,7 @@ class Guard:
         self._ramp = ramp
         self._tell = tell
         self._low_samples = 0
+        self._sagging_samples = 0
         self.last: HVSample | None = None
 
     @property
@@ -135,6 +138,14 @@ class Guard:
         faults = sample.flags & TRIP
         if faults:
             raise FaultError(f"hv: the supply reports {flag_names(faults)}.")
+        settled = HVFlag.ON in sample.flags and HVFlag.RAMPING not in sample.flags
+        sagging = settled and not sample.voltage >= sample.setpoint - max(SAG_V, SAG_PART * sample.setpoint)
+        self._sagging_samples = self._sagging_samples + 1 if sagging else 0
+        if self._sagging_samples >= SAG_SAMPLES:
+            raise FaultError(
+                f"hv: the output has sagged to {sample.voltage:.0f} V with {sample.setpoint:.0f} V set: "
+                "the film draws more current than the supply gives."
+            )
 
     def ramp_off(self, cause: str) -> None:
         """Ramp the output down, switch it off and latch SAFE. For orderly ends; does nothing if never armed."""
@@ -158,7 +169,7 @@ class Guard:
         self._low_samples = 0
 
 
-def flag_names(flags: HVFlag) -> str:
+def flag_names(flags: Flag) -> str:
     """The flags in plain words."""
     return ", ".join((flag.name or "").lower().replace("_", " ") for flag in flags)
 

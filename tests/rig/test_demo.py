@@ -1,4 +1,4 @@
-"""The main job: two runs of the demonstration with one seed give the same logs, and truth is found within its bounds."""
+"""The main job: one seed gives one log, and the truth is found within the stated uncertainties."""
 
 from __future__ import annotations
 

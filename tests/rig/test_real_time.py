@@ -1,0 +1,104 @@
+"""The same drivers and engine over pseudo-terminals and slcan, in real time, with the bench in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+FIXTURES = Path(str(files("sim_fixtures")))
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
+
+# Short ways, and patience with a busy machine: the time-outs are not what is tested here.
+CHANGES = {
+    "approach_from_mm = 36.0": "approach_from_mm = 5.0\ntimeout_s = 2.0",
+    'driver = "gsv8"': 'driver = "gsv8"\ntimeout_s = 2.0',
+    'driver = "keyence-lkg"': 'driver = "keyence-lkg"\ntimeout_s = 1.0',
+    'driver = "iseg-edcp"': 'driver = "iseg-edcp"\ntimeout_s = 2.0',
+    "contact_position_mm = 40.0": "contact_position_mm = 7.0\n[simulation.stage]\nstart_position_mm = 2.0",
+    "ramp_V_per_s = 300.0": "ramp_V_per_s = 1000.0",
+    "../calibrations": str(FIXTURES / "calibrations"),
+}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    text = (FIXTURES / "scenes" / "cone-4mm.toml").read_text()
+    # [simulation] goes on after the inserted [simulation.stage]: put its own keys first.
+    for old, new in CHANGES.items():
+        assert old in text, old
+        if old.startswith("contact"):
+            text = text.replace("rig_compliance_um_per_N = 2.0\n", "")
+        text = text.replace(old, new)
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture
+def ports(scene: Path, tmp_path: Path) -> Iterator[Path]:
+    with dea_rig("sim", scene) as bench:
+        try:
+            assert bench.stdout is not None
+            path = tmp_path / "ports.json"
+            path.write_text(bench.stdout.readline())
+            assert set(json.loads(path.read_text())) == {"stage", "force", "displacement", "hv"}
+            yield path
+        finally:
+            bench.terminate()
+            assert bench.wait(10) == 0
+
+
+def dea_rig(*arguments: str | Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "rig", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_the_job_end_to_end(scene: Path, ports: Path, tmp_path: Path) -> None:
+    log, fit = tmp_path / "run.mcap", tmp_path / "fit.json"
+    run = dea_rig("run", scene, FIXTURES / "protocols/short.toml", "-o", log, "--ports", ports, "--arm", "--yes")
+    out, err = run.communicate(timeout=90)
+    assert run.returncode == 0, err
+    assert "high voltage off" in out
+    identified = dea_rig("fit", log, "-o", fit)
+    out, err = identified.communicate(timeout=90)
+    assert identified.returncode == 0, err
+    found = json.loads(fit.read_text())
+    assert found["reduced_chi_square"] == pytest.approx(1.0, abs=0.25)
+    eps_r = found["quantities"]["eps_r"]
+    assert abs(eps_r["value"] - 1.7) < 4 * eps_r["standard_uncertainty"] < 1.7
+
+
+def test_without_arm_there_is_no_high_voltage_and_no_log(scene: Path, ports: Path, tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    run = dea_rig("run", scene, FIXTURES / "protocols/short.toml", "-o", log, "--ports", ports)
+    _, err = run.communicate(timeout=60)
+    assert run.returncode == 2 and "--arm" in err
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_run_safely(scene: Path, ports: Path, tmp_path: Path, number: signal.Signals) -> None:
+    from rig.log.reader import read_log
+
+    log = tmp_path / "run.mcap"
+    run = dea_rig("run", scene, FIXTURES / "protocols/short.toml", "-o", log, "--ports", ports, "--arm", "--yes")
+    assert run.stderr is not None
+    for line in run.stderr:
+        if "800 V" in line and "sweep: 0 to" in line:
+            break
+    time.sleep(0.5)
+    run.send_signal(number)
+    _, err = run.communicate(timeout=30)
+    assert run.returncode == 130, err
+    assert "high voltage off" in err
+    outcome = read_log(log).outcome
+    assert outcome is not None and outcome["status"] == "stopped" and outcome["safe"] == "yes"
