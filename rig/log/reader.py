@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -127,11 +128,9 @@ class Log:
                 try:
                     content = chunk_content(source, chunk.record)
                     described = dict.fromkeys(chunk.topics, ChannelInfo("", "", "", b""))
-                    for message in messages(content, described):
-                        topic = wanted.get(message.channel)
-                        if topic is not None:
-                            payload = content[message.start : message.end]
-                            yield topic, message.log_ns, message.publish_ns, payload
+                    for channel, _, log_ns, publish_ns, start, end in messages(content, described):
+                        if channel in wanted:
+                            yield wanted[channel], log_ns, publish_ns, content[start:end]
                 except Damaged as why:
                     raise LogError(self.path, f"changed while it was read ({why})", "Read it again.") from why
 
@@ -220,16 +219,20 @@ class _Tally:
 
     def add(self, content: bytes) -> dict[int, str]:
         """Count a chunk; the topics of its channels by number. Raises `Damaged`, and then counts nothing of it."""
-        count: dict[int, int] = {}
+        count: dict[int, int] = defaultdict(int)
         last: dict[int, int] = {}
-        first_ns, last_ns = 2**63, 0
+        beyond = 2**63
+        first_ns, last_ns = beyond, 0
         for channel, sequence, log_ns, publish_ns, _, _ in messages(content, self._channels):
-            count[channel] = count.get(channel, 0) + 1
+            count[channel] += 1
             last[channel] = sequence
-            first_ns, last_ns = min(first_ns, log_ns), max(last_ns, log_ns)
-            if publish_ns >= 2**63:
+            if log_ns < first_ns:
+                first_ns = log_ns
+            if log_ns > last_ns:
+                last_ns = log_ns
+            if publish_ns >= beyond:
                 raise Damaged("a chunk with an impossible time")
-        if last_ns >= 2**63:
+        if last_ns >= beyond:
             raise Damaged("a chunk with an impossible time")
         for channel in count:
             self._check_schema(self._channels[channel])

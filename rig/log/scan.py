@@ -86,15 +86,8 @@ class ChannelInfo(NamedTuple):
     schema_data: bytes
 
 
-class RawMessage(NamedTuple):
-    """A message in a chunk; its payload is ``content[start:end]``."""
-
-    channel: int
-    sequence: int
-    log_ns: int
-    publish_ns: int
-    start: int
-    end: int
+# channel, sequence, log time, publish time, start and end of the payload in the chunk's content
+RawMessage = tuple[int, int, int, int, int, int]
 
 
 class Source:
@@ -311,13 +304,10 @@ def messages(content: bytes, channels: dict[int, ChannelInfo]) -> Iterator[RawMe
     Raises `Damaged` when the content is not a sequence of schemas, channels and messages on described channels.
     """
     offset, size = 0, len(content)
-    unpack, make, described = _MESSAGE.unpack_from, RawMessage._make, -1
+    unpack, least, described = _MESSAGE.unpack_from, _MESSAGE.size, -1
     schemas: dict[int, tuple[str, bytes]] = {}
     while offset < size:
-        if size - offset < _HEAD.size:
-            raise Damaged("a chunk that ends in the middle of a record")
-        opcode = content[offset]
-        if opcode == Opcode.MESSAGE and size - offset >= _MESSAGE.size:
+        if content[offset] == 5 and size - offset >= least:  # Opcode.MESSAGE; this is the inner loop
             _, length, channel, sequence, log_ns, publish_ns = unpack(content, offset)
             end = offset + 9 + length
             if not 22 <= length <= MAX_MESSAGE + 22 or end > size:
@@ -326,9 +316,11 @@ def messages(content: bytes, channels: dict[int, ChannelInfo]) -> Iterator[RawMe
                 if channel not in channels:
                     raise Damaged("a chunk with messages of a channel that is nowhere described")
                 described = channel
-            yield make((channel, sequence, log_ns, publish_ns, offset + 31, end))
+            yield channel, sequence, log_ns, publish_ns, offset + least, end
         else:
-            _, length = _HEAD.unpack_from(content, offset)
+            if size - offset < _HEAD.size:
+                raise Damaged("a chunk that ends in the middle of a record")
+            opcode, length = _HEAD.unpack_from(content, offset)
             end = offset + 9 + length
             if end > size or opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
                 raise Damaged("a chunk with a record that does not belong there")
