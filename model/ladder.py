@@ -15,6 +15,7 @@ from model.output import Derivatives, Extremes, derivatives, extremes
 from model.ritz import Grid, Problem, State
 
 MOST_MODES = 64
+FIRST_MODES = 36  # the most to begin with
 MOST_STEPS = 25
 # Newton's step leaves an error of about the square of its relative size; a rung's change of the force is the error of
 # the rung below it, some times the error of the rung itself. Both factors are held to the truth by tests.
@@ -41,7 +42,7 @@ Settle = Callable[[Problem, Grid, State, float], Iterate]
 
 def first_modes(span: float, tolerance: float) -> int:
     """Modes that bring the truncation error near ``tolerance`` for ``ln(b/a) = span``: a start, not a promise."""
-    return max(2, math.ceil(-0.4 - math.log10(tolerance) * (0.25 + 0.12 * span)))
+    return min(FIRST_MODES, max(2, math.ceil(-0.4 - math.log10(tolerance) * (0.25 + 0.12 * span))))
 
 
 def next_modes(modes: int) -> int:

@@ -273,7 +273,7 @@ def _round(
     state = start.state
     mixed: NDArray[np.bool_] = np.zeros(len(index), dtype=np.bool_)
     if state.relaxed is not None:
-        mixed = np.logical_and(state.relaxed.any(axis=0), ~state.relaxed.all(axis=0)).any(axis=0)
+        mixed = np.asarray((state.relaxed.any(axis=0) & ~state.relaxed.all(axis=0)).any(axis=0))
     for kind in (False, True):
         some = np.flatnonzero(mixed == kind)
         if len(some) == 0:
