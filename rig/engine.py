@@ -312,7 +312,7 @@ class Engine:
             self._agreed = now
         elif now - self._agreed > DISAGREEMENT_S:
             raise FaultError(
-                f"stage and laser disagree beyond contact: {by_stage * 1e3:.2f} against {recorder.displacement * 1e3:.2f} mm. "
+                f"stage and laser disagree: {by_stage * 1e3:.2f} against {recorder.displacement * 1e3:.2f} mm. "
                 "One of them is frozen, or the pusher has slipped."
             )
 

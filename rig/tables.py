@@ -69,8 +69,8 @@ def identification_table(found: Identification) -> Group:
     for name, quantity in found.quantities.items():
         table.add_row(
             _NAMES.get(name, name),
-            f"{quantity.value:.5g} {quantity.unit}".strip(),
-            f"{quantity.uncertainty:.2g} {quantity.unit}".strip(),
+            _with_unit(quantity.value, quantity.unit, 5),
+            _with_unit(quantity.uncertainty, quantity.unit, 2),
             f"{100 * quantity.relative:.2g} %",
             quantity.verdict + (" (at its bound)" if quantity.at_bound else ""),
         )
@@ -106,11 +106,15 @@ def truth_table(found: Found) -> RenderableType:
             table.add_row(
                 _NAMES.get(name, name),
                 f"{known[name]:.5g}",
-                f"{quantity.value:.5g} {quantity.unit}".strip(),
+                _with_unit(quantity.value, quantity.unit, 5),
                 f"{100 * quantity.relative:.2g} %",
                 f"{(quantity.value - known[name]) / quantity.uncertainty:+.2f}",
             )
     return table
+
+
+def _with_unit(value: float, unit: str, digits: int) -> str:
+    return f"{value:.{digits}g}" + (f" {unit}" if unit != "1" else "")
 
 
 _NAMES = {"eps_r": "permittivity eps_r", "stiffness": "stiffness the data determine", "G": "shear modulus G"}
