@@ -145,7 +145,9 @@ class Run:
         for (step, voltage, cycle), indexes in parts.items():
             rows = np.flatnonzero(np.isin(self.phase, indexes))
             if rows.size:
-                label = f"{specimen.name or self.log.path.stem}, {voltage:g} V, step {step}, cycle {cycle + 1}"
+                label = f"{specimen.name or self.log.path.stem}, {voltage:g} V, step {step}" + (
+                    f", cycle {cycle}" if cycle else ""
+                )
                 direction = np.array([phase.direction for phase in self.phases], dtype=np.int8)[self.phase[rows]]
                 curves.append(
                     Curve(

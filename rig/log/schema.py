@@ -107,7 +107,7 @@ CHANNELS: dict[str, Channel] = {
             Field("step", "uint32", "index of the protocol step that begins here"),
             Field("kind", "string", "kind of the step: home, zero, approach, ramp, ..."),
             Field("label", "string", "the step's own name in the protocol, or its kind"),
-            Field("cycle", "uint32", "cycle within the step, from 0"),
+            Field("cycle", "uint32", "cycle within the step, from 1; 0 where the step has none"),
             Field("direction", "sint32", "+1 loading, -1 unloading, 0 neither"),
             Field("voltage_V", "double", "nominal voltage of the step, in volts"),
             Field("record", "bool", "true while the samples are meant for identification"),
