@@ -386,7 +386,7 @@ class GSV8:
         self._dialogue.run(now)
         # The golden ratio spreads the polls evenly over the sample period, whatever the two rates are.
         spread = 0.5 + 0.5 * (self._polls * 0.6180339887498949 % 1.0)
-        if self._clock is not None and self._clock.windows == 0:
+        if self._clock is not None and not self._clock.acquired:
             spread *= 0.2  # finds the phase of the stream sooner
         self._next_poll = min(now + self._interval * spread, self._dialogue.next_poll(now))
         return self._stamp(now, arrived)

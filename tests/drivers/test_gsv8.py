@@ -446,7 +446,7 @@ def test_a_stream_at_another_rate_is_an_error() -> None:
     rig = Rig().until_ready()
     rig.run(1.0)
     rig.amp.started, rig.amp.k, rig.amp.rate = rig.now, 0, 250.0
-    with pytest.raises(DeviceRefused, match=r"streams at 2\d\d(\.\d)? Hz although 100 Hz were set"):
+    with pytest.raises(DeviceRefused, match=r"streams at \d+\.?\d* Hz although 100 Hz were set"):
         rig.run(5.0)
 
 
