@@ -25,6 +25,9 @@ R = TypeVar("R")
 # How soon to look again while an answer is outstanding, for loops that cannot wait on the port itself.
 LOOK_AGAIN_S = 1e-3
 
+# How soon to look whether a port that was lost is back.
+LOST_AGAIN_S = 0.1
+
 
 def label(name: str, link: ByteLink | FrameLink) -> str:
     """Name of a device for messages, with its port."""

@@ -30,8 +30,8 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import NoReturn, TypeVar
 
-from drivers.dialogue import Answer, Ask, Dialogue, Schedule, Script, label
-from drivers.link import ByteLink, DeviceError, DeviceRefused, DeviceSilent
+from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import OK, DisplacementSample, Identity, SampleFlag
 
 T = TypeVar("T")
@@ -282,9 +282,14 @@ class KeyenceLKG:
             if self._ready and self._dialogue.idle and self._schedule.take(now):
                 self._dialogue.begin(self._measure())
             self._dialogue.run(now)
-        finally:
-            due = self._schedule.due if self._dialogue.idle else math.inf
-            self._next_poll = now if self._inbox else min(self._dialogue.next_poll(now), due)
+        except DeviceLost:
+            self._next_poll = now + LOST_AGAIN_S
+            raise
+        except DeviceError:
+            self._next_poll = now  # there may be more to read
+            raise
+        due = self._schedule.due if self._dialogue.idle else math.inf
+        self._next_poll = min(self._dialogue.next_poll(now), due)
         samples, self._samples = self._samples, []
         return samples
 

@@ -26,8 +26,8 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
-from drivers.dialogue import Answer, Ask, Dialogue, Schedule, Script, label
-from drivers.link import ByteLink, DeviceError, DeviceRefused, DeviceSilent
+from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import Identity, StageSample
 
 WARNINGS = {
@@ -156,7 +156,8 @@ class Codec:
     """Bytes from the stage to messages.
 
     A line with a wrong checksum, or that fits no grammar, is dropped and counted. Lines without a checksum are taken
-    only until the first one with a valid checksum has been seen: from then on the device is known to send them.
+    only until the first one with a valid checksum has been seen: from then on the device is known to send them. Alerts
+    count for themselves: a device may send checksums only in reply to a command that had one.
 
     ``counters``: ``bad_checksum``, ``without_checksum`` (dropped for it), ``bad_grammar``, ``too_long``,
     ``lost_continuation`` (packets whose rest never came, or the rest of a packet never seen).
@@ -166,7 +167,7 @@ class Codec:
         self.counters = {} if counters is None else counters
         for key in ("bad_checksum", "without_checksum", "bad_grammar", "too_long", "lost_continuation"):
             self.counters.setdefault(key, 0)
-        self.checksums_seen = False
+        self.checksums_seen = self._alert_checksums_seen = False
         self._buffer = bytearray()
         self._skipping = False
         self._unfinished: dict[tuple[int, int, int | None], list[Reply | Info]] = {}
@@ -205,7 +206,7 @@ class Codec:
             if checksum(body.encode("ascii")) != int(checked[2], 16):
                 self.counters["bad_checksum"] += 1
                 return None
-        elif self.checksums_seen:
+        elif self._alert_checksums_seen if kind == "!" else self.checksums_seen:
             self.counters["without_checksum"] += 1
             return None
         to_be_continued = body.endswith("\\")
@@ -213,9 +214,10 @@ class Codec:
         if message is None or (to_be_continued and isinstance(message, Alert)):
             self.counters["bad_grammar"] += 1
             return None
-        self.checksums_seen |= checked is not None
         if isinstance(message, Alert):
+            self._alert_checksums_seen |= checked is not None
             return message
+        self.checksums_seen |= checked is not None
         if isinstance(message, Info) and message.text.startswith("cont "):
             return self._next_part(message, to_be_continued)
         return self._first_part(message, to_be_continued)
@@ -359,6 +361,7 @@ class ZaberStage:
         self._faults_told: set[str] = set()
         self._step = math.nan
         self._travel_steps = (0, 0)
+        self._raw = 0
         self._max_speed = self._max_speed_at_start = 0
         self._knob_locked = False
         self._dialogue.begin(self._set_up())
@@ -405,6 +408,18 @@ class ZaberStage:
         target = min(max(round(position / self._step), self._travel_steps[0]), self._travel_steps[1])
         self._begin_motion(f"move abs {target}", max_speed=max(1, self._speed_data(speed)))
 
+    def move_by(self, distance: float, speed: float) -> None:
+        """Go ``distance`` (m) further at ``speed`` (m/s), from a standstill.
+
+        Sent as an absolute move: unlike ``move rel`` it does no harm when it arrives twice.
+        """
+        self._require_reference()
+        if self.moving:
+            raise DeviceRefused(
+                self._label, "it is still moving; by how much to go on is not defined", "Stop it first."
+            )
+        self.move_to(self._raw * self._step + distance, speed)
+
     def move_velocity(self, velocity: float) -> None:
         """Move at ``velocity`` (m/s, negative towards home) until stopped or at the end of the travel."""
         self._require_reference()
@@ -430,10 +445,14 @@ class ZaberStage:
                 self._dialogue.begin(self._watch())
             self._urgent.run(now)
             self._dialogue.run(now)
-        finally:
-            due = self._schedule.due if self._dialogue.idle else math.inf
-            next_poll = min(self._urgent.next_poll(now), self._dialogue.next_poll(now), due)
-            self._next_poll = now if self._inbox else next_poll
+        except DeviceLost:
+            self._next_poll = now + LOST_AGAIN_S
+            raise
+        except DeviceError:
+            self._next_poll = now  # there may be more to read
+            raise
+        due = self._schedule.due if self._dialogue.idle else math.inf
+        self._next_poll = min(self._urgent.next_poll(now), self._dialogue.next_poll(now), due)
         samples, self._samples = self._samples, []
         return samples
 
@@ -524,7 +543,7 @@ class ZaberStage:
         """One position; and all flags when the one shown is not the first of those known, or motion has ended."""
         was_busy = self._busy
         answer = yield from self._ask("get pos")
-        raw = self._whole(answer.message, "get pos")
+        raw = self._raw = self._whole(answer.message, "get pos")
         shown = answer.message.warning
         if shown == "--":
             self._see_flags(())

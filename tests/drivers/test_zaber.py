@@ -103,6 +103,14 @@ def test_what_is_wrong_is_dropped_and_counted_and_the_next_line_is_read(data: by
     assert {key: n for key, n in codec.counters.items() if n} == {counter: 1}
 
 
+def test_alerts_without_checksum_are_taken_until_one_had_it() -> None:
+    codec = Codec()
+    codec.feed(line("@01 1 29 OK BUSY -- 0"))
+    assert codec.feed(b"!01 1 IDLE --\r\n") == [Alert(1, 1, False, "--", "")]
+    assert codec.feed(line("!01 1 IDLE --") + b"!01 1 IDLE --\r\n") == [Alert(1, 1, False, "--", "")]
+    assert codec.counters["without_checksum"] == 1
+
+
 def test_line_without_end_does_not_fill_the_memory() -> None:
     codec = Codec()
     for _ in range(1000):
@@ -494,6 +502,20 @@ def test_move_velocity(homed: Bench) -> None:
     assert "move vel 3303" in homed.fake.log  # 3302.60
     homed.stage.stop()
     homed.until_still()
+
+
+def test_move_by(homed: Bench) -> None:
+    for expected in (2016, 4031):  # 2015.75 and twice that, each from where it stands
+        homed.stage.move_by(1e-3, 1e-3)
+        with pytest.raises(DeviceRefused, match="still moving"):
+            homed.stage.move_by(1e-3, 1e-3)
+        homed.until_still()
+        homed.run(0.05)
+        assert homed.fake.position == pytest.approx(expected, abs=1)
+    with pytest.raises(DeviceRefused, match="outside the travel"):
+        homed.stage.move_by(-3e-3, 1e-3)
+    with pytest.raises(DeviceRefused, match="outside the travel"):
+        homed.stage.move_by(math.nan, 1e-3)
 
 
 def test_lost_command_is_given_again_after_the_state_was_asked(homed: Bench) -> None:

@@ -162,7 +162,8 @@ def test_vanished_stage_is_lost_and_stays_so_until_the_port_is_back(rig: Rig) ->
 
 
 def test_alerts_between_command_and_reply(rig: Rig) -> None:
-    rig.inject("stage", "alert", duration_s=1.0, value=0.005)
+    for number in range(200):
+        rig.inject("stage", "alert", at_s=rig.t + 0.005 * number)
     rig.stage.move_to(5e-3, 5e-3)
     rig.until_still()
     assert rig.true_position(rig.t) == pytest.approx(5e-3, abs=0.3e-6)
@@ -283,7 +284,8 @@ def test_laser_that_sees_nothing_says_so_on_every_sample(
 
 
 def test_pushed_values_are_not_taken_for_answers(rig: Rig) -> None:
-    rig.inject("displacement", "alert", duration_s=0.5, value=0.003)
+    for number in range(150):
+        rig.inject("displacement", "alert", at_s=rig.t + 0.003 * number)
     rig.run(0.5)
     assert len(rig.values) == pytest.approx(50, abs=2) and rig.laser.counters["pushed"] > 100
 
