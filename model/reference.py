@@ -98,7 +98,7 @@ def reference(
 
     ``wrinkling`` is ``"plain"`` (the equations of Cao & Conn 2018, whatever the sign of the hoop stress) or
     ``"tension_field"``. Force and extremes are good to about 1e-12 relative where ``converged`` is set. Where hoop
-    tension is lost the plain equations have answers that no film has: what is given then is the branch that leads there.
+    tension is lost the plain equations have answers that no film has: given then is the branch that leads there.
     """
     if wrinkling not in ("plain", "tension_field"):
         raise ValueError(f'wrinkling is "{wrinkling}"; allowed are "plain" and "tension_field"')

@@ -1,7 +1,7 @@
 """The paper's method in GNU Octave: index-1 DAE with ``ode15s``, shooting with ``fsolve``; stands in for MATLAB.
 
 Octave is a program of its own: it gets a script and numbers in a temporary folder and prints its answer. The time in
-the result is measured inside it, so that starting Octave does not count.
+the result is processor time measured inside it, so that starting Octave does not count.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ global evaluations
 evaluations = 0;
 warning("off", "all");
 p = struct(%s);
-begun = tic;
+begun = cputime;
 [u, rest, flag] = fsolve(@(u) miss(u, p), p.guess, optimset("TolX", p.tol, "TolFun", p.tol));
 [R, y, pull] = integrate(u, p);
-spent = toc(begun);
+spent = cputime - begun;
 at = linspace(log(p.disk), 0, 41)';
 l1 = interp1(log(R), y(:, 4), at, "spline");
 l2 = interp1(log(R), p.lp * y(:, 1) ./ R, at, "spline");

@@ -1,0 +1,178 @@
+"""Pictures of the benchmarks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from rig.benchmark.extremes import Report as Extremes
+    from rig.benchmark.solver import Report as Precision
+
+# Colours of Okabe & Ito (2008), which colour-blind readers tell apart; one family of methods shares a colour.
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE, GREY = (
+    "#000000",
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+    "#CC79A7",
+    "#999999",
+)
+LOOK: dict[str, tuple[str, str, str]] = {  # colour, marker, line
+    "Octave ode15s shooting": (ORANGE, "s", "-"),
+    "BDF shooting": (VERMILLION, "v", "-"),
+    "Radau shooting": (VERMILLION, "^", "--"),
+    "LSODA shooting": (SKY, "v", ":"),
+    "RK45 shooting": (SKY, "^", "--"),
+    "DOP853 shooting": (BLUE, "D", "-"),
+    "solve_bvp in R": (GREEN, "P", "--"),
+    "solve_bvp in ln R": (GREEN, "X", "-"),
+    "Chebyshev in R": (PURPLE, "<", "--"),
+    "Chebyshev in ln R": (PURPLE, ">", "-"),
+}
+
+
+def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
+
+
+def _finish(figure: Any, path: Path) -> None:
+    from matplotlib import pyplot
+
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def _tidy(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(True, which="major", color="#e3e3e3", linewidth=0.8)
+    axes.set_axisbelow(True)
+
+
+def work_precision(report: Precision, path: Path) -> None:
+    """Error against time, log-log, one line a method and one panel a quantity."""
+    figure, panels = _figure(13.0, 5.4, 1, 3, sharex=True, sharey=True)
+    methods = list(dict.fromkeys(point.method for point in report.points))
+    quantities = (("force", "Force"), ("field", "Peak electric field"), ("hoop", "Least hoop stress"))
+    for axes, (name, title) in zip(panels, quantities, strict=True):
+        for method in methods:
+            points = [point for point in report.points if point.method == method]
+            x = [1e3 * point.seconds.median for point in points]
+            y = [max(getattr(point, name).median, 1e-15) for point in points]
+            ours = method not in LOOK
+            colour, marker, line = LOOK.get(method, (BLACK, "o", "-" if method == methods[0] else "--"))
+            axes.plot(
+                x,
+                y,
+                color=colour,
+                marker=marker,
+                linestyle=line,
+                label=f"{method} (this project)" if ours else method,
+                linewidth=2.8 if ours else 1.5,
+                markersize=7.5 if ours else 5.5,
+                zorder=5 if ours else 2,
+            )
+        axes.set(xscale="log", yscale="log", title=title, xlabel="time per solve / ms")
+        axes.set_ylim(1e-15, 1e-2)
+        _tidy(axes)
+    panels[0].set_ylabel("median error (stress: over shear modulus)")
+    panels[2].annotate(
+        "better",
+        xy=(0.62, 0.80),
+        xytext=(0.78, 0.92),
+        xycoords="axes fraction",
+        arrowprops={"arrowstyle": "->", "color": "#555555"},
+        color="#555555",
+    )
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False)
+    figure.suptitle(f"Error against run time, {report.cases} taut films: each mark is one tolerance of one method")
+    _finish(figure, path)
+
+
+def speeds(report: Precision, path: Path) -> None:
+    """Time per solve at an error of 1e-6, one bar a method and way of working."""
+    rows = sorted(report.speeds, key=lambda speed: -speed.seconds)
+    figure, axes = _figure(10.0, 1.1 + 0.34 * len(rows))
+    mode = {"cold single": "", "sweep": ", curve of 50 points", "batch": " of 1000 states"}
+    for i, speed in enumerate(rows):
+        amount = 1e6 * speed.seconds
+        axes.barh(i, amount, color=BLUE if speed.method.startswith("dea-rig") else "#bbbbbb")
+        text = f"{amount / 1000:.3g} ms" if amount >= 1000 else f"{amount:.3g} µs"
+        if speed.error > 1e-6:
+            text += f" (reaches only {speed.error:.0e})"
+        axes.text(amount * 1.1, i, text, va="center")
+    axes.set_yticks(range(len(rows)), [f"{speed.method}{mode[speed.mode]}" for speed in rows])
+    known = [1e6 * speed.seconds for speed in rows]
+    axes.set(xscale="log", xlabel="time per solve / µs (logarithmic)")
+    axes.set_xlim(0.4 * min(known, default=1.0), 12 * max(known, default=1.0))
+    figure.suptitle("Time per solve, with nine of ten forces within 1e-6 (blue: this project)")
+    _tidy(axes)
+    axes.grid(False, axis="y")
+    _finish(figure, path)
+
+
+STATUS_LOOK: dict[str, str] = {
+    "TAUT": BLUE,
+    "WRINKLED": SKY,
+    "SLACK": "#d9d9d9",
+    "UNSTABLE": ORANGE,
+    "NOT_CONVERGED": VERMILLION,
+    "INVALID": "#777777",
+}
+
+
+def extreme_states(report: Extremes, path: Path) -> None:
+    """What became of the states of every family, and how the true error compares with the estimate."""
+    rows = report.rows[::-1]
+    figure, (left, right) = _figure(12.5, 1.6 + 0.42 * len(rows), 1, 2, sharey=True, width_ratios=(3, 2))
+    for i, row in enumerate(rows):
+        begin = 0.0
+        for status, colour in STATUS_LOOK.items():
+            share = 100.0 * row.counts.get(status, 0) / row.states
+            left.barh(i, share, left=begin, color=colour, edgecolor="white", label=status if i == 0 else None)
+            if share >= 6:
+                dark = status in ("TAUT", "NOT_CONVERGED", "INVALID")
+                left.text(
+                    begin + share / 2,
+                    i,
+                    str(row.counts[status]),
+                    ha="center",
+                    va="center",
+                    color="white" if dark else "black",
+                    fontsize=8,
+                )
+            begin += share
+        if row.checked:
+            right.plot([max(row.median_ratio, 1e-6), max(row.worst_ratio, 1e-6)], [i, i], color=GREY, linewidth=1.5)
+            right.plot(max(row.median_ratio, 1e-6), i, "o", color=BLUE, label="median" if i == len(rows) - 1 else None)
+            right.plot(
+                max(row.worst_ratio, 1e-6), i, "D", color=VERMILLION, label="worst" if i == len(rows) - 1 else None
+            )
+    left.set_yticks(range(len(rows)), [row.family for row in rows])
+    left.set(xlabel="share of the states / % (numbers: states)", xlim=(0, 100))
+    left.set_title("What the solver says of each state", loc="left")
+    handles, labels = left.get_legend_handles_labels()
+    wording = {"NOT_CONVERGED": "not converged"}
+    shown = [wording.get(label, label.lower()) for label in labels]
+    figure.legend(handles, shown, loc="outside lower left", ncols=len(labels), frameon=False)
+    right.axvline(1.0, color=BLACK, linewidth=1)
+    right.axvline(10.0, color=VERMILLION, linewidth=1, linestyle="--")
+    right.text(1.0, len(rows) - 0.4, "as estimated ", ha="right", va="bottom", fontsize=8)
+    right.text(10.0, len(rows) - 0.4, " limit: 10", ha="left", va="bottom", color=VERMILLION, fontsize=8)
+    right.set(xscale="log", xlabel="true error / estimated error of the force", ylim=(-0.6, len(rows) + 0.2))
+    right.set_title("Is the error estimate honest?", loc="left", pad=14)
+    right.legend(loc="lower left", frameon=False, fontsize=8)
+    _tidy(left)
+    _tidy(right)
+    left.grid(False, axis="y")
+    _finish(figure, path)

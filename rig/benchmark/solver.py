@@ -1,0 +1,572 @@
+"""Error against run time: the membrane solver and every method of comparison, over their tolerances, on many states.
+
+Times are processor time of one process, so that what else runs on the machine matters little, and mean something only
+as ratios within one run: every method solves one state before any goes on to the next, in several rounds, and the least
+time counts. References come from `model.reference`, which does not compete.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from time import process_time  # what work costs; when things happen is the clock's business
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import baselines, membrane
+from model.baselines import Result
+from model.materials import NAMED
+from model.reference import Reference, reference
+from model.specimen import Specimen
+from rig.benchmark.cases import Case, taut_cases
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]  # share done, what is being done
+
+OURS = "dea-rig"
+BATCH = "dea-rig in a batch"
+WANTED = 1e-6  # error of the force at which speeds are compared
+NINE_OF_TEN = 0.9
+WRONG = 1e-2  # a force further off than this is no answer
+OCTAVE = "Octave ode15s shooting"
+
+TOLERANCES: dict[str, tuple[float, ...]] = {
+    OURS: (1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10),
+    OCTAVE: (1e-4, 1e-5, 1e-6),
+    "BDF shooting": (1e-4, 1e-5, 1e-6, 1e-7),
+    "Radau shooting": (1e-4, 1e-5, 1e-6, 1e-8),
+    "LSODA shooting": (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10),
+    "RK45 shooting": (1e-4, 1e-5, 1e-6, 1e-7, 1e-8),
+    "DOP853 shooting": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10),
+    "solve_bvp in R": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8),
+    "solve_bvp in ln R": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8),
+    "Chebyshev in R": (1e-3, 1e-5, 1e-7, 1e-9),
+    "Chebyshev in ln R": (1e-3, 1e-5, 1e-7, 1e-9),
+}
+SLOW = {OCTAVE: 3, "BDF shooting": 6, "Radau shooting": 6}  # states that they get in a quick run
+SHOOTING = ("LSODA shooting", "RK45 shooting", "DOP853 shooting", "BDF shooting", "Radau shooting")
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Of one quantity over the cases."""
+
+    median: float
+    nine_of_ten: float
+    largest: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        known = np.array([v for v in values if math.isfinite(v)])
+        if known.size == 0:
+            return cls(math.nan, math.nan, math.nan)
+        return cls(float(np.median(known)), float(np.quantile(known, NINE_OF_TEN)), float(known.max()))
+
+
+@dataclass(frozen=True)
+class Point:
+    """One method at one tolerance, cold single solves.
+
+    ``seconds`` of one solve; ``force`` and ``field`` are relative errors, ``hoop`` is the error of the least hoop
+    stress over the shear modulus; ``failures`` are cases without an answer, or with a force more than 1 % off.
+    """
+
+    method: str
+    tolerance: float
+    cases: int
+    failures: int
+    seconds: Spread
+    force: Spread
+    field: Spread
+    hoop: Spread
+    evaluations: float  # median
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Time per solve in one way of working, at the loosest tolerance that keeps nine of ten forces within 1e-6."""
+
+    mode: str
+    method: str
+    tolerance: float
+    seconds: float
+    error: float  # of the force, nine of ten
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """How many times one thing is faster, or dearer, than another."""
+
+    what: str
+    value: float
+    wanted: str
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """A batch of so many states."""
+
+    states: int
+    seconds: float
+    peak_memory_MB: float  # allocated while solving
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the solver benchmark found; see `render` and the files that `run` writes."""
+
+    full: bool
+    cases: int
+    points: list[Point]
+    speeds: list[Speed]
+    ratios: list[Ratio]
+    scaling: list[Scaling]
+    one_off: dict[str, float]  # seconds
+    environment: dict[str, str]
+    notes: list[str] = field(default_factory=list)
+
+
+def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None) -> Report:
+    """Measure, and write ``solver.json``, ``solver.csv``, ``solver.png`` and ``solver_speed.png`` into ``out_dir``."""
+    report = measure(cases=150 if full else 24, full=full, progress=progress)
+    save(report, out_dir)
+    return report
+
+
+def save(report: Report, out_dir: Path) -> None:
+    """Write the report as JSON, CSV and pictures."""
+    from rig.benchmark import plot
+
+    out_dir.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(_plain(asdict(report)), indent=1, allow_nan=False)
+    (out_dir / "solver.json").write_text(text + "\n", encoding="utf-8")
+    with (out_dir / "solver.csv").open("w", encoding="utf-8", newline="") as file:
+        rows = [_flat(asdict(point)) for point in report.points]
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    plot.work_precision(report, out_dir / "solver.png")
+    plot.speeds(report, out_dir / "solver_speed.png")
+
+
+def _plain(value: object) -> object:
+    """NaN and inf have no place in JSON: null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _flat(row: dict[str, object]) -> dict[str, object]:
+    out: dict[str, object] = {}
+    for key, value in row.items():
+        if isinstance(value, dict):
+            out |= {f"{key}_{name}": item for name, item in value.items()}
+        else:
+            out[key] = value
+    return out
+
+
+# ---- measuring
+
+
+@dataclass
+class _Cell:
+    """One method at one tolerance on one state."""
+
+    seconds: float = math.inf
+    result: Result | None = None
+
+
+Cells = dict[tuple[str, float], dict[int, _Cell]]  # by method and tolerance, then by number of the state
+
+
+def measure(
+    cases: int,
+    *,
+    full: bool = False,
+    methods: Sequence[str] | None = None,
+    batch: int = 1000,
+    rounds: int = 3,
+    details: bool = True,
+    progress: Progress = lambda share, what: None,
+) -> Report:
+    """The benchmark on ``cases`` states; ``methods`` names those to run beside ours (all by default).
+
+    ``details`` are curves, wrinkled films, cost against number of states, and one-off costs.
+    """
+    notes: list[str] = []
+    chosen = [OURS, *(baselines.BASELINES if methods is None else methods)]
+    if OCTAVE in chosen and baselines.octave_available() is None:
+        chosen.remove(OCTAVE)
+        notes.append("octave-cli is not on PATH: the stand-in for the paper's MATLAB was not run.")
+    progress(0.0, "reference values")
+    states, truth = taut_cases(cases)
+    cells = _cold(states, chosen, full, rounds, lambda share, what: progress(0.05 + 0.7 * share, what))
+    points = [_point(method, tolerance, found, states, truth) for (method, tolerance), found in cells.items()]
+    progress(0.75, "batches")
+    points += _batch_points(states, truth, batch)
+    progress(0.8, "force-displacement curves")
+    speeds = [s for method in (*chosen, BATCH) if (s := _speed(points, method)) is not None]
+    speeds += _sweeps(states, chosen) if details else []
+    progress(0.9, "wrinkled films")
+    wrinkled = _wrinkled(batch) if details else {}
+    progress(0.95, "cost against number of states, one-off costs")
+    scaling = _scaling((10, 100, 1000, 10_000, *((100_000,) if full else ()))) if details else []
+    return Report(
+        full=full,
+        cases=len(states),
+        points=points,
+        speeds=speeds,
+        ratios=_ratios(speeds, cells, wrinkled),
+        scaling=scaling,
+        one_off=_one_off() if details else {},
+        environment=_environment(),
+        notes=notes,
+    )
+
+
+def _solve(method: str, case: Case, tolerance: float) -> Result:
+    if method != OURS:
+        return baselines.BASELINES[method](case.specimen, case.h, case.voltage, tolerance)
+    found = membrane.solve(case.specimen, case.h, case.voltage, tolerance=tolerance)
+    good = found.status is membrane.Status.TAUT
+    return Result(found.force, found.peak_field, found.min_hoop_stress, good, found.status.message, found.iterations)
+
+
+def _cold(states: Sequence[Case], chosen: Sequence[str], full: bool, rounds: int, progress: Progress) -> Cells:
+    """Single solves from scratch, state by state: what disturbs the machine disturbs all methods alike."""
+    cells: Cells = {(method, tolerance): {} for method in chosen for tolerance in TOLERANCES[method]}
+    for method in chosen:
+        _solve(method, states[0], TOLERANCES[method][0])  # imports and caches are one-off costs
+    for turn in range(rounds):
+        for i, case in enumerate(states):
+            progress((turn + i / len(states)) / rounds, f"single solves, round {turn + 1} of {rounds}")
+            for (method, tolerance), found in cells.items():
+                some = SLOW.get(method)
+                if some is not None and (turn > 0 or i >= (5 * some if full else some)):
+                    continue
+                cell = found.setdefault(i, _Cell())
+                for _ in range(1 if some else 2):
+                    begun = process_time()
+                    cell.result = _solve(method, case, tolerance)
+                    elapsed = process_time() - begun
+                    own = cell.result.seconds
+                    cell.seconds = min(cell.seconds, elapsed if own is None else own)
+    return cells
+
+
+def _point(method: str, tolerance: float, found: dict[int, _Cell], states: Sequence[Case], truth: Reference) -> Point:
+    seconds, force, peak, hoop, evaluations = [], [], [], [], []
+    for i, cell in found.items():
+        case, result = states[i], cell.result
+        if result is None or not result.ok:
+            continue
+        error = float(abs(result.force / truth.force[i] - 1.0))
+        if not error <= WRONG:
+            continue
+        seconds.append(cell.seconds)
+        evaluations.append(float(result.evaluations))
+        force.append(error)
+        hoop.append(
+            float(abs(result.min_hoop_stress - truth.min_hoop_stress[i])) / case.specimen.material.shear_modulus
+        )
+        if case.voltage > 0:
+            peak.append(float(abs(result.peak_field / truth.peak_field[i] - 1.0)))
+    return Point(
+        method,
+        tolerance,
+        len(found),
+        len(found) - len(force),
+        Spread.of(seconds),
+        Spread.of(force),
+        Spread.of(peak),
+        Spread.of(hoop),
+        float(np.median(evaluations)) if evaluations else math.nan,
+    )
+
+
+def _batch_points(states: Sequence[Case], truth: Reference, batch: int) -> list[Point]:
+    """The same states in one call, over and over until they make a batch; time is per state."""
+    n = len(states)
+    several = [states[i % n] for i in range(max(batch, n))]
+    specimens = [case.specimen for case in several]
+    h = np.array([case.h for case in several])
+    voltage = np.array([case.voltage for case in several])
+    points = []
+    for tolerance in TOLERANCES[OURS]:
+        best = math.inf
+        for _ in range(5):
+            begun = process_time()
+            found = membrane.solve_many(specimens, h, voltage, tolerance=tolerance)
+            best = min(best, process_time() - begun)
+        cells = {
+            i: _Cell(
+                best / len(several),
+                Result(
+                    float(found.force[i]),
+                    float(found.peak_field[i]),
+                    float(found.min_hoop_stress[i]),
+                    bool(found.status[i] == membrane.Status.TAUT),
+                    "",
+                    int(found.iterations[i]),
+                ),
+            )
+            for i in range(n)
+        }
+        points.append(_point(BATCH, tolerance, cells, states, truth))
+    return points
+
+
+def _speed(points: Sequence[Point], method: str) -> Speed | None:
+    """At the loosest tolerance that does; failing that, at the tightest."""
+    mine = [point for point in points if point.method == method and point.failures <= 0.1 * point.cases]
+    if not mine:
+        return None
+    good = [point for point in mine if point.force.nine_of_ten <= WANTED]
+    point = good[0] if good else mine[-1]
+    mode = "batch" if method == BATCH else "cold single"
+    return Speed(mode, method, point.tolerance, point.seconds.median, point.force.nine_of_ten)
+
+
+def _sweeps(states: Sequence[Case], chosen: Sequence[str]) -> list[Speed]:
+    """A force-displacement curve of 50 points at each film's voltage, one solve after the other or in one call."""
+    speeds = []
+    films = states[:3]
+    curves = [np.linspace(0.8, 1.0, 50) * case.h for case in films]
+    truths = [reference(case.specimen, h[::7], case.voltage).force for case, h in zip(films, curves, strict=True)]
+    methods = {"dea-rig, one call": _curve_ours}
+    if "DOP853 shooting" in chosen:
+        methods["DOP853 shooting, each from the last"] = _curve_shooting
+    for name, curve in methods.items():
+        for tolerance in (1e-4, 1e-5, 1e-6, 1e-7):
+            times, errors = [], []
+            for case, h, force in zip(films, curves, truths, strict=True):
+                best = math.inf
+                for _ in range(2):
+                    begun = process_time()
+                    found = curve(case, h, tolerance)
+                    best = min(best, process_time() - begun)
+                times.append(best / h.size)
+                errors.append(np.abs(found[::7] / force - 1.0))
+            error = float(np.quantile(np.nan_to_num(np.concatenate(errors), nan=np.inf), NINE_OF_TEN))
+            if error <= WANTED:
+                speeds.append(Speed("sweep", name, tolerance, float(np.median(times)), error))
+                break
+    return speeds
+
+
+def _curve_ours(case: Case, h: Array, tolerance: float) -> Array:
+    return membrane.solve_many(case.specimen, h, case.voltage, tolerance=tolerance).force
+
+
+def _curve_shooting(case: Case, h: Array, tolerance: float) -> Array:
+    start = None
+    forces = []
+    for height in h:
+        found = baselines.explicit_shooting(case.specimen, float(height), case.voltage, tolerance, start=start)
+        start = found.start
+        forces.append(found.force)
+    return np.array(forces)
+
+
+def _wrinkled(batch: int) -> dict[str, float]:
+    """Time (s) of a tension-field state and of a taut one of the same film, to 1e-6, alone and in a batch."""
+    film = Specimen(4e-3, 20e-3, 40e-6, 1.0, NAMED["parker-cao2018"])
+    taut = replace(film, prestretch=1.2)
+    h, voltage = 12e-3, 1500.0
+    known = float(reference(film, h, voltage, wrinkling="tension_field").force[0])
+    out: dict[str, float] = {}
+    for tolerance in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
+        found = membrane.solve(film, h, voltage, tolerance=tolerance, wrinkling="tension_field")
+        out["error"] = abs(found.force / known - 1.0)
+        if out["error"] <= WANTED:
+            break
+    heights = np.linspace(0.8, 1.0, batch) * h
+    jobs: dict[str, Callable[[], object]] = {
+        "taut": lambda: membrane.solve(taut, h, voltage, tolerance=WANTED),
+        "wrinkled": lambda: membrane.solve(film, h, voltage, tolerance=tolerance, wrinkling="tension_field"),
+        "taut batch": lambda: membrane.solve_many(taut, heights, voltage, tolerance=WANTED),
+        "wrinkled batch": lambda: membrane.solve_many(
+            film, heights, voltage, tolerance=tolerance, wrinkling="tension_field"
+        ),
+    }
+    for name, job in jobs.items():
+        best = math.inf
+        for _ in range(5):
+            begun = process_time()
+            job()
+            best = min(best, process_time() - begun)
+        out[name] = best
+    return out
+
+
+def _ratios(speeds: Sequence[Speed], cells: Cells, wrinkled: dict[str, float]) -> list[Ratio]:
+    """Medians over the states of the ratios of times on the same state, at the tolerances of ``speeds``."""
+    good = {s.method: s for s in speeds if s.mode != "sweep" and s.error <= WANTED}
+    ratios: list[Ratio] = []
+
+    def faster(than: str) -> float:
+        ours, theirs = cells[OURS, good[OURS].tolerance], cells[than, good[than].tolerance]
+        return float(np.median([theirs[i].seconds / ours[i].seconds for i in theirs]))
+
+    if OURS in good:
+        for than in ("solve_bvp in R", "solve_bvp in ln R"):
+            if than in good:
+                ratios.append(Ratio(f"cold single against {than}", faster(than), ">= 15"))
+        shooting = [method for method in SHOOTING if method in good]
+        if shooting:
+            best = min(shooting, key=lambda method: good[method].seconds)
+            ratios.append(Ratio(f"cold single against {best}, the best shooting", faster(best), ">= 7"))
+        others = [method for method in good if method not in (OURS, BATCH)]
+        if others:
+            best = min(others, key=lambda method: good[method].seconds)
+            ratios.append(Ratio(f"cold single against {best}, the best of all others", faster(best), "> 1"))
+    if BATCH in good:
+        for than in ("solve_bvp in R", "solve_bvp in ln R"):
+            if than in good:
+                value = good[than].seconds / good[BATCH].seconds
+                ratios.append(Ratio(f"batch, per state, against {than}", value, ">= 500"))
+    if wrinkled.get("error", math.inf) <= WANTED:
+        ratios.append(Ratio("wrinkled over taut, cold single", wrinkled["wrinkled"] / wrinkled["taut"], "<= 6"))
+        value = wrinkled["wrinkled batch"] / wrinkled["taut batch"]
+        ratios.append(Ratio("wrinkled over taut, batch", value, "<= 6"))
+    return ratios
+
+
+def _scaling(counts: Sequence[int]) -> list[Scaling]:
+    """Time and memory of batches of growing size."""
+    film = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
+    rows = []
+    for count in counts:
+        h = np.linspace(2e-3, 15e-3, count)
+        best = math.inf
+        for _ in range(3 if count <= 10_000 else 1):
+            begun = process_time()
+            membrane.solve_many(film, h, 1000.0)
+            best = min(best, process_time() - begun)
+        tracemalloc.start()
+        try:
+            membrane.solve_many(film, h, 1000.0)
+            memory = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        rows.append(Scaling(count, best, memory / 1e6))
+    return rows
+
+
+_FRESH = """
+from time import process_time
+begun = process_time()
+{imports}
+imported = process_time()
+{first}
+print(imported - begun, process_time() - imported)
+"""
+_FILM = "Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED['parker-cao2018'])"
+
+
+def _one_off() -> dict[str, float]:
+    """Seconds, in a fresh interpreter: imports, and the first solve, which also fills caches."""
+    jobs = {
+        "dea-rig": ("from model.membrane import solve", f"solve({_FILM}, 10e-3, 1500.0)"),
+        "SciPy (DOP853 shooting)": (
+            "import scipy.integrate, scipy.optimize\nfrom model.baselines import explicit_shooting as solve",
+            f"solve({_FILM}, 10e-3, 1500.0, 1e-6)",
+        ),
+    }
+    out = {}
+    for name, (imports, first) in jobs.items():
+        common = "\nfrom model.materials import NAMED\nfrom model.specimen import Specimen"
+        done = subprocess.run(
+            [sys.executable, "-c", _FRESH.format(imports=imports + common, first=first)],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        imported, solved = (float(v) for v in done.stdout.split())
+        out[f"{name}: import"] = imported
+        out[f"{name}: first solve"] = solved
+    return out
+
+
+def _environment() -> dict[str, str]:
+    import scipy
+
+    return {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "processors": str(os.cpu_count()),
+        "load": f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown",
+    }
+
+
+# ---- showing
+
+
+def render(report: Report) -> RenderableType:
+    """Tables for the terminal."""
+    from rich.console import Group
+    from rich.table import Table
+
+    table = Table(
+        title=f"Error against run time: {report.cases} taut states, cold single solves",
+        caption="Median over the states, worst of nine in ten after the dash. Force and field: relative. "
+        "Hoop: least hoop stress over the shear modulus.",
+    )
+    for heading in ("method", "tolerance", "states", "failed", "ms", "force", "field", "hoop"):
+        table.add_column(heading, justify="left" if heading == "method" else "right")
+    last = ""
+    for point in report.points:
+        if point.method != last:
+            table.add_section()
+        table.add_row(
+            point.method if point.method != last else "",
+            f"{point.tolerance:.0e}",
+            str(point.cases),
+            str(point.failures or ""),
+            f"{1e3 * point.seconds.median:.3g}",
+            *(f"{s.median:.0e} - {s.nine_of_ten:.0e}" for s in (point.force, point.field, point.hoop)),
+        )
+        last = point.method
+    speed = Table(title="Time per solve, where possible with nine of ten forces within 1e-6")
+    for heading in ("way of working", "method", "tolerance", "us", "error"):
+        speed.add_column(heading, justify="left" if heading in ("way of working", "method") else "right")
+    for s in report.speeds:
+        speed.add_row(s.mode, s.method, f"{s.tolerance:.0e}", f"{1e6 * s.seconds:.3g}", f"{s.error:.0e}")
+    ratio = Table(title="Ratios, this run")
+    for heading in ("what", "ratio", "wanted"):
+        ratio.add_column(heading, justify="left" if heading == "what" else "right")
+    for r in report.ratios:
+        ratio.add_row(r.what, f"{r.value:.3g}", r.wanted)
+    size = Table(title="Cost against number of states (tolerance 1e-8)")
+    for heading in ("states", "s", "us per state", "peak memory / MB"):
+        size.add_column(heading, justify="right")
+    for row in report.scaling:
+        size.add_row(
+            f"{row.states}", f"{row.seconds:.3g}", f"{1e6 * row.seconds / row.states:.3g}", f"{row.peak_memory_MB:.1f}"
+        )
+    one_off = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report.one_off.items())
+    setting = ", ".join(f"{name} {value}" for name, value in report.environment.items())
+    lines = [
+        f"One-off costs, not counted above: {one_off}." if one_off else "",
+        f"Measured on: {setting}.",
+        *report.notes,
+    ]
+    return Group(table, speed, ratio, size, *(line for line in lines if line))
