@@ -39,7 +39,7 @@ SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
 SHARE_BOUNDS = (1e-6, 100.0)
 EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
 PERMITTIVITY_BOUNDS = (0.5, 200.0)
-SEARCH, FINAL = (1e-6, 40), (1e-9, 200)  # relative decrease of chi-square and evaluations that end a fit
+SEARCH, FINAL = (1e-5, 40), (1e-6, 100)  # relative decrease of chi-square and evaluations that end a fit
 AT_BOUND = 1e-4  # distance to a bound, relative to the distance of the bounds
 SAME_MINIMUM = 0.5  # chi-square by which two minima may differ and count as one
 
@@ -104,7 +104,7 @@ def identify(
             )
             if not fits:
                 raise IdentificationError("no fit converged from any starting point; is the specimen's geometry right?")
-            best = fits[0]
+            best = _representative(fits)
         else:
             again = _minimise(problem, best.restarted(problem), held, FINAL)
             best = best if again is None else again
@@ -278,6 +278,12 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort:
     )
 
 
+def _representative(fits: Sequence[_Fit]) -> _Fit:
+    """The best fit; among equals one whose terms all carry stiffness, where its curvature tells more."""
+    equals = [fit for fit in fits if fit.cost - fits[0].cost < SAME_MINIMUM / 2]
+    return min(equals, key=lambda fit: (int(fit.at_bound.sum()), fit.cost))
+
+
 def _other_minima(fits: Sequence[_Fit]) -> list[str]:
     """Words for sets of parameters that differ from the best one by more than 20 % and fit as well."""
     best = fits[0]
@@ -306,7 +312,7 @@ def _assemble(
         raise IdentificationError(f"{problem.data_rows} independent values cannot determine {free} parameters")
     probability = float(gammaincc(misfit_freedom / 2, fit.cost / 2))
     misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
-    rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits[1:]]
+    rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits]
     stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals)
     curves = _curve_results(problem, x)
     used = sum(curve.used for curve in curves)

@@ -26,7 +26,7 @@ from model.membrane import solve_many
 
 Array = NDArray[np.float64]
 
-NODES = 16
+NODES = 12
 TOLERANCE = 1e-8  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
 INVALID_RESIDUAL = 1e8  # where the membrane has no state; larger than any real residual
 

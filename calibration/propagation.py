@@ -11,13 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.problem import Problem
-from calibration.result import Quantity, Stiffness, Zero
+from calibration.result import Quantity, Stiffness, Zero, verdict
 from model.materials import Material
 
 Array = NDArray[np.float64]
-
-IDENTIFIED = 0.05  # relative standard uncertainty up to which a quantity counts as identified ...
-WEAKLY_IDENTIFIED = 0.30  # ... and as weakly identified
 
 # Systematic effects: entry in the budget, the curve's field with its relative standard uncertainty, what it scales.
 SYSTEMATIC = (
@@ -122,13 +119,7 @@ class Propagation:
             budget["other solutions"] = math.sqrt(spread - budget["noise"] ** 2)
         total = math.hypot(*budget.values()) if known else math.inf
         relative = total / abs(value) if value else math.inf
-        if relative <= IDENTIFIED and not at_bound:
-            verdict = "identified"
-        elif relative <= WEAKLY_IDENTIFIED and not at_bound:
-            verdict = "weakly identified"
-        else:
-            verdict = "not identifiable from this data"
-        return Quantity(value, total, unit, budget, verdict, at_bound)
+        return Quantity(value, total, unit, budget, verdict(relative, at_bound), at_bound)
 
     def budget(self, gradient: Array) -> dict[str, float]:
         """Independent parts of the standard uncertainty of a function of x with this gradient."""

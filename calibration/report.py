@@ -15,9 +15,8 @@ from typing import Any
 from calibration import figures
 from calibration.curve import Curve
 from calibration.identify import secant_modulus
-from calibration.propagation import IDENTIFIED, WEAKLY_IDENTIFIED
 from calibration.reduction import select
-from calibration.result import CONVENTION, Identification, Quantity
+from calibration.result import CONVENTION, IDENTIFIED, WEAKLY_IDENTIFIED, Identification, Quantity
 from model.materials import Material
 
 

@@ -12,6 +12,19 @@ from model.materials import Material
 CONVENTION = "W = sum mu_n/alpha_n (l1^alpha_n + l2^alpha_n + (l1 l2)^-alpha_n - 3), G = 1/2 sum mu_n alpha_n"
 
 
+IDENTIFIED = 0.05  # relative standard uncertainty up to which a quantity counts as identified ...
+WEAKLY_IDENTIFIED = 0.30  # ... and as weakly identified
+
+
+def verdict(relative: float, at_bound: bool) -> str:
+    """What a relative standard uncertainty amounts to; a parameter at its bound is not identified at all."""
+    if relative <= IDENTIFIED and not at_bound:
+        return "identified"
+    if relative <= WEAKLY_IDENTIFIED and not at_bound:
+        return "weakly identified"
+    return "not identifiable from this data"
+
+
 @dataclass(frozen=True)
 class Quantity:
     """One identified number.

