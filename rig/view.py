@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from rig.clock import RealClock
 from rig.errors import ConfigError, RigError
 from rig.log.dataset import Run, load_run
+from rig.log.text import printable
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -183,7 +184,7 @@ def _add_phases(recording: rr.RecordingStream, run: Run) -> None:
 
     t = np.array([phase.t for phase in run.phases])
     lanes = {
-        "step": [f"{phase.step} {_printable(phase.kind)}" for phase in run.phases],
+        "step": [f"{phase.step} {printable(phase.kind)}" for phase in run.phases],
         "direction": [DIRECTIONS.get(phase.direction, "?") for phase in run.phases],
     }
     if run.has_hv:
@@ -286,7 +287,7 @@ def _add_events(recording: rr.RecordingStream, run: Run) -> None:
             EVENTS,
             indexes=[_times(np.array(times))],
             columns=rr.TextLog.columns(
-                text=[f"{t:8.2f} s   {_printable(text)}" for t, text in zip(times, texts, strict=True)],
+                text=[f"{t:8.2f} s   {printable(text)}" for t, text in zip(times, texts, strict=True)],
                 level=list(names),
             ),
         )
@@ -295,9 +296,9 @@ def _add_events(recording: rr.RecordingStream, run: Run) -> None:
 def _about(run: Run) -> str:
     """The run in words, as Markdown."""
     log = run.log
-    lines = [f"# {_printable(log.path.name)}", ""]
+    lines = [f"# {printable(log.path.name)}", ""]
     for title, table in (("Run", log.metadata.get("run", {})), ("Outcome", log.outcome or {"status": "cut short"})):
-        lines += [f"## {title}", "", *(f"- {_printable(k)}: {_printable(v)}" for k, v in table.items() if v), ""]
+        lines += [f"## {title}", "", *(f"- {printable(k)}: {printable(v)}" for k, v in table.items() if v), ""]
     lines += ["## Messages", "", *(f"- {topic}: {count}" for topic, count in log.topics.items()), ""]
     if not log.whole:
         lines += ["## What could not be read", ""]
@@ -331,11 +332,6 @@ def _ticks(values: NDArray[np.float64]) -> NDArray[np.float64]:
     step *= next(factor for factor in (1, 2, 5, 10) if span / (factor * step) <= 6)
     ticks: NDArray[np.float64] = step * np.arange(np.floor(low / step + 1e-9), np.ceil(high / step - 1e-9) + 1)
     return ticks
-
-
-def _printable(text: str) -> str:
-    """Text from a log without control characters."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
 def _open_viewer(recording: Path, folder: Path) -> None:
@@ -429,7 +425,7 @@ def _last_words(folder: Path) -> str:
     text = re.sub(r"\x1b\[[0-9;]*m", "", (folder / "messages.txt").read_text(errors="replace"))
     panic = text.find("panicked at")
     words = text[panic:].splitlines()[:2] if panic >= 0 else text.splitlines()[-3:]
-    return _printable(" ".join(words))
+    return printable(" ".join(words))
 
 
 def _why_no_picture(messages: str) -> str:

@@ -55,6 +55,7 @@ class ContainerWriter:
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._described: list[bytes] = []  # per channel: its schema and channel records
+        self._counts: list[int] = []
         self._sequence: list[int] = []
         self._chunk_indexes: list[ChunkIndex] = []
         self._attachment_indexes: list[AttachmentIndex] = []
@@ -67,7 +68,7 @@ class ContainerWriter:
     @property
     def messages(self) -> int:
         """How many messages have been added."""
-        return sum(self._sequence)
+        return sum(self._counts)
 
     @property
     def chunk_is_empty(self) -> bool:
@@ -81,13 +82,14 @@ class ContainerWriter:
             self._schemas.append(schema)
         channel = Channel(len(self._channels) + 1, topic, "protobuf", {}, schema.id)
         self._channels.append(channel)
+        self._counts.append(0)
         self._sequence.append(0)
         self._described.append(_record(schema) + _record(channel))
         self._put(self._described[-1])
         return channel.id
 
-    def add_message(self, channel: int, data: bytes, log_ns: int, publish_ns: int) -> None:
-        """Add a message to the chunk in the making; its sequence number counts from 1 in each channel."""
+    def add_message(self, channel: int, data: bytes, log_ns: int, publish_ns: int, sequence: int | None = None) -> None:
+        """Add a message to the chunk in the making; sequence numbers count from 1 in each channel unless given."""
         index = self._indexes.get(channel)
         if index is None:
             index = self._indexes[channel] = bytearray()
@@ -97,8 +99,10 @@ class ContainerWriter:
         self._chunk_first_ns = min(self._chunk_first_ns, log_ns)
         self._chunk_last_ns = max(self._chunk_last_ns, log_ns)
         self._messages += 1
-        self._sequence[channel - 1] += 1
-        sequence = self._sequence[channel - 1] & 0xFFFFFFFF
+        self._counts[channel - 1] += 1
+        if sequence is None:
+            sequence = self._sequence[channel - 1] + 1
+        self._sequence[channel - 1] = sequence
         index += _INDEX_ENTRY.pack(log_ns, self._size)
         self._add_to_chunk(
             _MESSAGE_HEAD.pack(Opcode.MESSAGE, 22 + len(data), channel, sequence, log_ns, publish_ns) + data
@@ -189,7 +193,7 @@ class ContainerWriter:
         return Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._channels),
-            channel_message_counts=dict(enumerate(self._sequence, 1)),
+            channel_message_counts=dict(enumerate(self._counts, 1)),
             chunk_count=len(self._chunk_indexes),
             message_count=self.messages,
             message_end_time=self._last_ns,

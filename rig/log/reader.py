@@ -38,7 +38,7 @@ class Attachment(NamedTuple):
 
 class _Chunk(NamedTuple):
     record: Record
-    topics: dict[int, str]  # of the channels that have messages in it
+    channels: dict[int, ChannelInfo]  # those that have messages in it
 
 
 @dataclass(frozen=True)
@@ -116,23 +116,33 @@ class Log:
             for topic, (log_times, publish_times, payloads) in rows.items()
         }
 
+    def raw_messages(self) -> Iterator[tuple[ChannelInfo, int, int, int, bytes] | None]:
+        """All messages as written: channel, sequence number, log time, publish time, payload; None ends each chunk."""
+        with Source(self.path) as source:
+            for chunk in self._chunks:
+                content = self._content(source, chunk)
+                for channel, sequence, log_ns, publish_ns, start, end in messages(content, dict(chunk.channels)):
+                    yield chunk.channels[channel], sequence, log_ns, publish_ns, content[start:end]
+                yield None
+
     def _payloads(self, topics: set[str]) -> Iterator[tuple[str, int, int, bytes]]:
         unknown = topics - schema.CHANNELS.keys()
         if unknown:
             raise LogError(self.path, f"no log has a topic {', '.join(sorted(unknown))}")
         with Source(self.path) as source:
             for chunk in self._chunks:
-                wanted = {number: topic for number, topic in chunk.topics.items() if topic in topics}
-                if not wanted:
-                    continue
-                try:
-                    content = chunk_content(source, chunk.record)
-                    described = dict.fromkeys(chunk.topics, ChannelInfo("", "", "", b""))
-                    for channel, _, log_ns, publish_ns, start, end in messages(content, described):
+                wanted = {number: info.topic for number, info in chunk.channels.items() if info.topic in topics}
+                if wanted:
+                    content = self._content(source, chunk)
+                    for channel, _, log_ns, publish_ns, start, end in messages(content, dict(chunk.channels)):
                         if channel in wanted:
                             yield wanted[channel], log_ns, publish_ns, content[start:end]
-                except Damaged as why:
-                    raise LogError(self.path, f"changed while it was read ({why})", "Read it again.") from why
+
+    def _content(self, source: Source, chunk: _Chunk) -> bytes:
+        try:
+            return chunk_content(source, chunk.record)
+        except Damaged as why:
+            raise LogError(self.path, f"changed while it was read ({why})", "Read it again.") from why
 
     def _decode(self, topic: str, payload: bytes) -> dict[str, Any]:
         try:
@@ -217,8 +227,8 @@ class _Tally:
         self._checked: set[ChannelInfo] = set()
         self._sequence: dict[str, int] = {}
 
-    def add(self, content: bytes) -> dict[int, str]:
-        """Count a chunk; the topics of its channels by number. Raises `Damaged`, and then counts nothing of it."""
+    def add(self, content: bytes) -> dict[int, ChannelInfo]:
+        """Count a chunk; its channels by number. Raises `Damaged`, and then counts nothing of it."""
         count: dict[int, int] = defaultdict(int)
         last: dict[int, int] = {}
         beyond = 2**63
@@ -246,7 +256,7 @@ class _Tally:
         if count:
             self.start_ns = first_ns if self.start_ns is None else min(self.start_ns, first_ns)
             self.end_ns = max(self.end_ns, last_ns)
-        return {channel: self._channels[channel].topic for channel in count}
+        return {channel: self._channels[channel] for channel in count}
 
     def _check_schema(self, channel: ChannelInfo) -> None:
         if channel in self._checked or channel.topic not in schema.CHANNELS:

@@ -312,7 +312,7 @@ print(json.dumps(costs))
 
 @pytest.fixture(scope="module")
 def hostile_costs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Any, float, float, float]]:
-    """For each file: what came of it, processor seconds, peak MiB above before, its size in MiB. One process for all."""
+    """For each file: what came of it, processor seconds, peak MiB above before, its size in MiB."""
     folder = tmp_path_factory.mktemp("hostile")
     for number, content in enumerate(HOSTILE.values()):
         (folder / f"{number:03}.mcap").write_bytes(content)

@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from rig.log import writer
+from rig.log import part_file
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
@@ -218,7 +218,7 @@ def full_after(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
         state["left"] -= n
         return n
 
-    monkeypatch.setattr(writer.os, "write", write)
+    monkeypatch.setattr(part_file.os, "write", write)
 
 
 @pytest.mark.parametrize("limit", [7_000, 7_001, 9_777, 20_000])
@@ -266,7 +266,7 @@ def test_an_interrupt_during_a_write_leaves_no_torn_record(tmp_path, monkeypatch
             raise KeyboardInterrupt
         return real(fd, data)
 
-    monkeypatch.setattr(writer.os, "write", write)
+    monkeypatch.setattr(part_file.os, "write", write)
     with pytest.raises(KeyboardInterrupt), LogWriter(path) as log:
         for k in range(5000):
             write_force(log, k)

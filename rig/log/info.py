@@ -1,0 +1,87 @@
+"""A log on one screen."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from rig.log.reader import Log, read_log
+from rig.log.schema import ROLES
+from rig.log.text import printable
+
+MOST_LINES = 12
+
+
+def info(path: Path) -> str:
+    """What the log at ``path`` holds: run, devices, rates, gaps, outcome.
+
+    Raises `LogError` when it cannot be read.
+    """
+    log = read_log(path)
+    lines = [f"{path}: {_state(log)}", ""]
+    lines += _table("run", log.metadata.get("run", {}))
+    lines += [_row("began", _date(log.start_ns)), _row("lasted", f"{(log.end_ns - log.start_ns) * 1e-9:.3f} s")]
+    lines += _table("outcome", log.outcome if log.outcome is not None else {"status": "not recorded"})
+    lines += ["", *_devices(log)]
+    lines += ["", *_rates(log)]
+    if log.attachments:
+        lines += ["", "inside"]
+        lines += _most([f"  {printable(a.name)}  {len(a.data)} bytes" for a in log.attachments.values()])
+    if log.gaps:
+        lines += ["", "could not be read"]
+        lines += _most([f"  bytes {gap.start} to {gap.end}: {gap.reason}" for gap in log.gaps])
+    return "\n".join(lines)
+
+
+def _state(log: Log) -> str:
+    size = f"{log.path.stat().st_size / 1e6:.1f} MB"
+    if log.whole:
+        return f"whole, {size}"
+    if log.ended:
+        return f"DAMAGED, {size}; dea-rig recover copies what is sound"
+    return f"CUT SHORT, {size}; dea-rig recover makes it whole"
+
+
+def _devices(log: Log) -> list[str]:
+    """What each instrument said of itself at the start of the run."""
+    lines = ["devices"]
+    said: dict[str, str] = {}
+    for message in log.messages("/event"):
+        if message.fields["message"].startswith("model "):
+            said.setdefault(message.fields["source"], message.fields["message"])
+    for role in ROLES:
+        if any(topic.startswith((f"/{role}/", f"/raw/{role}/")) for topic in log.topics):
+            lines.append(_row(role, said.get(role, "")))
+    return lines
+
+
+def _rates(log: Log) -> list[str]:
+    lines = [f"{'topic':<24}{'messages':>10}{'missing':>10}{'rate / Hz':>12}{'longest pause / s':>20}"]
+    tables = log.tables(list(log.topics))
+    for topic, count in log.topics.items():
+        t = np.sort(tables[topic]["t_s"])
+        steps = np.diff(t)
+        streams = topic.endswith("/sample") and steps.size > 0 and float(np.median(steps)) > 0
+        rate = f"{1.0 / float(np.median(steps)):12.2f}" if streams else f"{'-':>12}"
+        pause = f"{float(steps.max()):20.4f}" if streams else f"{'-':>20}"
+        lines.append(f"{topic:<24}{count:>10}{log.missing.get(topic, 0):>10}{rate}{pause}")
+    lines += [f"{printable(topic):<24}{count:>10}  (not of this program)" for topic, count in log.unknown.items()]
+    return lines
+
+
+def _table(title: str, table: dict[str, str]) -> list[str]:
+    return [_row(f"{title}.{key}", value) for key, value in table.items() if value]
+
+
+def _row(name: str, value: str) -> str:
+    return f"  {printable(name):<24}{printable(value)}"
+
+
+def _most(lines: list[str]) -> list[str]:
+    return lines if len(lines) <= MOST_LINES else [*lines[:MOST_LINES], f"  ... and {len(lines) - MOST_LINES} more"]
+
+
+def _date(ns: int) -> str:
+    return datetime.fromtimestamp(ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -1,0 +1,108 @@
+"""A file that has its name only once it is complete."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from rig.log.errors import LogError
+
+
+class PartFile:
+    """Written as ``<path>.part`` (or with another ``ending``), unbuffered; `finish` syncs it and gives it its name. It never overwrites another.
+
+    The first failed write closes the file for good: what had been written before stays, cut after the last whole
+    `put`, and every later call raises. Raises `LogError`, from the constructor too.
+    """
+
+    def __init__(self, path: Path, ending: str = ".part") -> None:
+        self.path = path
+        self.part = path.with_name(path.name + ending)
+        self._failure: LogError | None = None
+        self._size = 0
+        for existing in (self.path, self.part):
+            if existing.exists():
+                raise LogError(
+                    existing, "exists already", "Nothing is overwritten: name another file, or move this one away."
+                )
+        try:
+            self._fd: int | None = os.open(self.part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+            _sync_directory(self.part.parent)
+        except OSError as error:
+            raise LogError(path, f"cannot be made ({error.strerror})", "Name a directory you can write to.") from error
+
+    @property
+    def is_open(self) -> bool:
+        return self._fd is not None
+
+    def check(self) -> None:
+        """Raise unless more can be written."""
+        if self._failure is not None:
+            raise LogError(self._failure.path, self._failure.what, self._failure.advice)
+        if self._fd is None:
+            raise LogError(self.path, "is finished; nothing can be added")
+
+    def put(self, data: bytes) -> None:
+        """Append all of ``data``."""
+        self.check()
+        assert self._fd is not None
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[os.write(self._fd, view) :]
+        except BaseException as error:  # an interrupt may leave a torn record just as a full disk does
+            with suppress(OSError):
+                os.ftruncate(self._fd, self._size)
+            self._close()
+            reason = error.strerror if isinstance(error, OSError) else type(error).__name__
+            failure = self._fail(f"writing failed ({reason}); nothing more is written")
+            if isinstance(error, OSError):
+                raise failure from error
+            raise
+        self._size += len(data)
+
+    def finish(self) -> None:
+        """Sync the file and give it its name."""
+        self.end()
+        if self.path.exists():
+            raise self._fail(f"a file of this name appeared meanwhile; this one is complete in {self.part}")
+        try:
+            self.part.rename(self.path)
+            _sync_directory(self.path.parent)
+        except OSError as error:
+            raise self._fail(f"cannot be given its name ({error.strerror}); it is complete in {self.part}") from error
+
+    def end(self) -> None:
+        """Sync and close the file, and leave it as ``.part``."""
+        self.check()
+        assert self._fd is not None
+        try:
+            os.fsync(self._fd)
+        except OSError as error:
+            raise self._fail(f"the disk did not confirm the end of the file ({error.strerror})") from error
+        finally:
+            self._close()
+
+    def discard(self) -> None:
+        """Remove the unfinished file."""
+        self._close()
+        self.part.unlink(missing_ok=True)
+
+    def _close(self) -> None:
+        if self._fd is not None:
+            fd, self._fd = self._fd, None
+            with suppress(OSError):
+                os.close(fd)
+
+    def _fail(self, what: str) -> LogError:
+        self._failure = LogError(self.path, what, "Free some space or use another disk, then repeat the run.")
+        return self._failure
+
+
+def _sync_directory(directory: Path) -> None:
+    fd = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
