@@ -114,43 +114,53 @@ class SimulatedBench:
     # Time
 
     def _next_action(self) -> float:
-        due = min((thing.next_time for thing in self._actors), default=math.inf)
+        """When something happens next that sensors must not overlook."""
+        due = self._due[0][0] if self._due else math.inf
+        for actor in self._actors:
+            due = min(due, actor.next_time)
         for wire in self._wires:
             due = min(due, wire.next_delivery)
-        return min(due, self._due[0][0]) if self._due else due
+        return due
 
     def next_time(self) -> float:
         """When something happens next by itself, or arrives at either end of a wire; inf if nothing will."""
-        due = min((sensor.next_time for sensor in self._sensors), default=math.inf)
+        due = self._next_action()
+        for sensor in self._sensors:
+            due = min(due, sensor.next_time)
         for wire in self._wires:
             due = min(due, wire.next_arrival)
-        return min(due, self._next_action())
+        return due
 
     def advance(self, t: float) -> None:
         """Let everything up to time ``t`` happen, in the order of time."""
         while True:
-            step = max(min(self._next_action(), t), self.now)
+            due = self._next_action()
+            step = max(min(due, t), self.now)
             for sensor in self._sensors:
                 sensor.advance(step)
+            self.now = step
+            if due > t:
+                return
             for actor in self._actors:
                 actor.advance(step)
-            for role in self.instruments:
-                self._deliver(role, step)
+            self._deliver(step)
             while self._due and self._due[0][0] <= step:
                 _, number, begins, fault = heapq.heappop(self._due)
                 self._switch(fault, number, begins, step)
-            self.now = step
-            if step >= t and self._next_action() > t:
-                return
 
-    def _deliver(self, role: str, t: float) -> None:
-        instrument = self.instruments[role]
-        if isinstance(instrument, IsegEDCP):
-            for arrived, frame in self._frames[role].deliveries(t):
-                instrument.receive(frame, arrived)
-        else:
-            for arrived, data in self._bytes[role].deliveries(t):
-                instrument.receive(data, arrived)
+    def _deliver(self, t: float) -> None:
+        for role, wire in self._bytes.items():
+            if wire.next_delivery <= t:
+                instrument = self.instruments[role]
+                assert not isinstance(instrument, IsegEDCP)
+                for arrived, data in wire.deliveries(t):
+                    instrument.receive(data, arrived)
+        for role, bus in self._frames.items():
+            if bus.next_delivery <= t:
+                supply = self.instruments[role]
+                assert isinstance(supply, IsegEDCP)
+                for arrived, frame in bus.deliveries(t):
+                    supply.receive(frame, arrived)
 
     # Faults
 

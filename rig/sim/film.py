@@ -10,8 +10,10 @@ interpolation is checked against the solver between the nodes before it is used.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -65,16 +67,22 @@ def _coefficients(values: Floats) -> Floats:
 
 
 def _clenshaw(coefficients: Floats, x: Floats) -> Floats:
-    """Sum of c_k T_k(2 x - 1) over the first axis of ``coefficients`` (k, ..., 1 or n), for x (n,).
-
-    Only additions and multiplications element by element, so that a value never depends on its neighbours.
-    """
+    """Sum of c_k T_k(2 x - 1) over the first axis of ``coefficients`` (k, ..., 1 or n), for x (n,)."""
     y = 4.0 * x - 2.0  # twice the argument of T_k
     b1 = b2 = np.zeros_like(x)
     for c in coefficients[:0:-1]:
         b1, b2 = c + y * b1 - b2, b1
     total: Floats = coefficients[0] + 0.5 * y * b1 - b2
     return total
+
+
+def _clenshaw_at(coefficients: list[float], x: float) -> float:
+    """The same for one x: plain numbers, because instruments ask one at a time."""
+    y = 4.0 * x - 2.0
+    b1 = b2 = 0.0
+    for c in coefficients[:0:-1]:
+        b1, b2 = c + y * b1 - b2, b1
+    return coefficients[0] + 0.5 * y * b1 - b2
 
 
 @dataclass(frozen=True)
@@ -109,9 +117,31 @@ class FilmTable:
         u = np.minimum(ratio * ratio, 1.0) + np.zeros_like(w)
         return s * _clenshaw(_clenshaw(self._force[:, :, None], w), u)
 
-    def breakdown_voltage(self, s: Floats) -> Floats:
-        """Voltage (V) at which the peak field reaches the film's strength at indentation ``s`` (n,)."""
-        return np.full_like(s, np.inf) if self._breakdown is None else _clenshaw(self._breakdown, self._w(s))
+    def force_at(self, s: float, voltage: float) -> float:
+        """`force` at one indentation and voltage."""
+        x = min(s / self.reach, 1.0)
+        w = x * x
+        columns, bound, _ = self._lists
+        u = 0.0
+        if bound:
+            ratio = voltage / _clenshaw_at(bound, w)
+            u = min(ratio * ratio, 1.0)
+        return s * _clenshaw_at([_clenshaw_at(column, w) for column in columns], u)
+
+    def breakdown_voltage_at(self, s: float) -> float:
+        """Voltage (V) at which the peak field reaches the film's strength at indentation ``s`` (m)."""
+        _, _, breakdown = self._lists
+        x = min(s / self.reach, 1.0)
+        return _clenshaw_at(breakdown, x * x) if breakdown else math.inf
+
+    @cached_property
+    def _lists(self) -> tuple[list[list[float]], list[float], list[float]]:
+        """Columns of G, V_c and breakdown voltage as plain numbers; empty where there is none."""
+        return (
+            self._force.T.tolist(),
+            [] if self._bound is None else self._bound.tolist(),
+            [] if self._breakdown is None else self._breakdown.tolist(),
+        )
 
     def bound(self, s: Floats) -> Floats:
         """Largest voltage (V) in the table at indentation ``s`` (n,)."""

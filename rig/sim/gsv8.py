@@ -12,13 +12,10 @@ import struct
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from rig.sim.settings import ForceTruth
 from rig.sim.wire import ByteWire
 from rig.sim.world import World
-
-Floats = npt.NDArray[np.float64]
 
 CHANNELS: Final = 8
 INT16, INT24, FLOAT = 1, 2, 3
@@ -29,7 +26,6 @@ MAX_RATE = {INT16: 48_000.0, INT24: 24_000.0, FLOAT: 12_000.0}
 MIN_RATE = 0.1
 ANSWER_S = 1e-3
 PARAMETER_TIMEOUT_S = 0.2
-FRAME_BLOCK = 4096  # samples computed at once
 
 # Error codes
 OK, CHANGED = 0x00, 0x01
@@ -68,8 +64,10 @@ class GSV8:
         self._buffer = bytearray()
         self._buffer_since = 0.0
         self.saturated = 0
-        self._wrong_status = 0
-        self._frame: tuple[npt.NDArray[np.uint8], int, int] | None = None
+        self._status = 0
+        self._noise = settings.noise_fraction * settings.sensitivity_mV_per_V
+        self._mV_per_V_per_N = settings.sensitivity_mV_per_V * (1.0 + settings.gain_error) / settings.full_scale_N
+        self._frame: tuple[bytes, tuple[bytes, bytes]] | None = None
         self._frozen: float | None = None
         # Kept in non-volatile memory
         self._rate = settings.stored_rate_Hz
@@ -97,11 +95,11 @@ class GSV8:
 
     def freeze(self, t: float, frozen: bool) -> None:
         """A fault: from now on every sample has the value of time ``t``."""
-        self._frozen = float(self._bridge(np.array([t]))[0]) if frozen else None
+        self._frozen = self._bridge(t) if frozen else None
 
     def set_status(self, bits: int) -> None:
         """A fault: these bits of the status byte are set in every frame from now on."""
-        self._wrong_status, self._frame = bits, None
+        self._status = bits
 
     # What it measures
 
@@ -109,53 +107,40 @@ class GSV8:
         """Input range (mV/V) of an input type: inverse to its bridge supply."""
         return self._settings.input_range_mV_per_V * {BRIDGE_8V75: 5 / 8.75, BRIDGE_5V: 1.0, BRIDGE_2V5: 2.0}[kind]
 
-    def _bridge(self, t: Floats) -> Floats:
-        """What the bridge puts out (mV/V) at the times ``t`` (n,), without noise."""
-        s = self._settings
+    def _bridge(self, t: float) -> float:
+        """What the bridge puts out (mV/V) at time ``t``, without noise."""
         if self._frozen is not None:
-            return np.full(t.shape, self._frozen)
-        sensitivity = s.sensitivity_mV_per_V * (1.0 + s.gain_error) / s.full_scale_N
-        return self._world.force(t) * sensitivity + s.zero_offset_mV_per_V
+            return self._frozen
+        return self._world.force_at(t) * self._mV_per_V_per_N + self._settings.zero_offset_mV_per_V
 
-    def _frames(self, t: Floats) -> tuple[bytes, int]:
-        """Frames for the samples at ``t``, end to end, and the length of one."""
-        s = self._settings
-        span = self.input_range(self._input_type[self._cell])
-        top = span * s.raw_range_factor
+    def _sample(self, t: float) -> bytes:
+        """The frame with the sample of time ``t``."""
         reading = self._bridge(t)
-        if self._frozen is None and s.noise_fraction:
-            reading = reading + s.noise_fraction * s.sensitivity_mV_per_V * self._rng.standard_normal(len(t))
+        if self._noise and self._frozen is None:
+            reading += self._noise * float(self._rng.standard_normal())
+        top = self.input_range(self._input_type[self._cell]) * self._settings.raw_range_factor
         if self.saturated:
-            reading = np.full(t.shape, math.copysign(2 * top, self.saturated))
-        overload = np.abs(reading) > top
-        reading = np.clip(reading, -top, top)
-        raw = np.rint((reading - self._zero[self._cell]) / top * 2**23)
-        raw = np.clip(raw, -(2**23), 2**23 - 1)
-        template, at, width = self._template()
-        frames = np.tile(template, (len(t), 1))
-        frames[:, at : at + width] = self._encode(raw, self._cell)
-        frames[overload, 2] |= 1
-        size = template.size
-        return frames.tobytes(), size
+            reading = math.copysign(2 * top, self.saturated)
+        raw = round((min(max(reading, -top), top) - self._zero[self._cell]) / top * 2**23)
+        head, tail = self._around()
+        status = self._type << 4 | 0x80 | self._status | (abs(reading) > top)
+        return head + bytes([status]) + tail[0] + self._encode(raw, self._cell) + tail[1]
 
-    def _template(self) -> tuple[npt.NDArray[np.uint8], int, int]:
-        """A frame with nothing on any input; where the load cell's value stands in it, and how wide it is."""
+    def _around(self) -> tuple[bytes, tuple[bytes, bytes]]:
+        """What stands around the load cell's value in a frame: before the status byte, before and after the value."""
         if self._frame is None:
-            width = WIDTH[self._type]
-            parts = [self._encode(np.zeros(1), channel).tobytes() for channel in range(CHANNELS)]
-            head = bytes([0xAA, 0x10 | (CHANNELS - 1), 0x80 | self._type << 4 | self._wrong_status])
-            frame = np.frombuffer(head + b"".join(parts) + b"\x85", dtype=np.uint8)
-            self._frame = frame, 3 + self._cell * width, width
+            idle = [self._encode(0, channel) for channel in range(CHANNELS)]
+            after = b"".join(idle[self._cell + 1 :]) + b"\x85"
+            self._frame = bytes([0xAA, 0x10 | (CHANNELS - 1)]), (b"".join(idle[: self._cell]), after)
         return self._frame
 
-    def _encode(self, raw: Floats, channel: int) -> npt.NDArray[np.uint8]:
-        """Raw 24-bit numbers (n,) as bytes (n, width) of the present value type."""
+    def _encode(self, raw: int, channel: int) -> bytes:
+        """A raw 24-bit number in the present value type."""
+        raw = min(max(raw, -(2**23)), 2**23 - 1)
         if self._type == FLOAT:
-            scale = self._user_scale[channel] * self._settings.raw_range_factor / 2**23
-            value = (raw * scale + self._user_offset[channel]).astype(">f4")
-            return value.view(np.uint8).reshape(-1, 4)
-        offset = (raw.astype(np.int64) + 2**23).astype(">u4").view(np.uint8).reshape(-1, 4)
-        return offset[:, 1:] if self._type == INT24 else offset[:, 1:3]
+            share = raw / 2**23 * self._settings.raw_range_factor
+            return struct.pack(">f", self._user_scale[channel] * share + self._user_offset[channel])
+        return (raw + 2**23).to_bytes(3, "big")[: WIDTH[self._type]]
 
     # Time
 
@@ -171,21 +156,16 @@ class GSV8:
     def advance(self, t: float) -> None:
         """Send the frames that are due up to ``t``."""
         if self._buffer and t > self._buffer_since + PARAMETER_TIMEOUT_S:
+            given_up = self._buffer_since + PARAMETER_TIMEOUT_S
             self._buffer.clear()
-            self._answer(TIMEOUT, b"", self._buffer_since + PARAMETER_TIMEOUT_S)
-        if not self._transmitting:
-            return
-        period = self._period
-        while True:
-            first = self._count + 1
-            last = min(math.floor((t - self._start) / period + 1e-9), self._count + FRAME_BLOCK)
-            if last < first:
-                return
-            times = self._start + np.arange(first, last + 1, dtype=np.float64) * period
-            data, size = self._frames(times)
-            for i, time in enumerate(times.tolist()):
-                self._wire.send(data[i * size : (i + 1) * size], time)
-            self._count = last
+            self._stream(given_up)
+            self._answer(TIMEOUT, b"", given_up)
+        self._stream(t)
+
+    def _stream(self, t: float) -> None:
+        while (due := self.next_time) <= t:
+            self._wire.send(self._sample(due), due)
+            self._count += 1
 
     # Bytes in
 
@@ -230,8 +210,7 @@ class GSV8:
         if len(p) != count:
             return self._answer(WRONG_COUNT, b"", t)
         if code == 0x3B:  # GetValue: one measured frame is the answer
-            data, _ = self._frames(np.array([t]))
-            self._wire.send(data, t + ANSWER_S)
+            self._wire.send(self._sample(t), t + ANSWER_S)
             return None
         if code == 0x78:
             self._answer(OK, b"", t)
@@ -319,7 +298,7 @@ class GSV8:
                 return OK, struct.pack(">f", table[one])
             case 0x0C:
                 for channel in channels:
-                    self._zero[channel] = float(self._bridge(np.array([t]))[0]) if channel == self._cell else 0.0
+                    self._zero[channel] = self._bridge(t) if channel == self._cell else 0.0
             case 0x0F:
                 return OK, bytes([self._unit[one]])
             case 0x10:

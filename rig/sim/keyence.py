@@ -105,7 +105,7 @@ class KeyenceLKG:
             return self._frozen
         s = self._settings
         middle = max(t - 0.5 * self._window(out), 0.0)
-        true = float(self._world.displacement(np.array([middle]))[0]) * 1e3
+        true = self._world.displacement_at(middle) * 1e3
         fewer = self._averaging[1] if out == 1 else 0
         noise = s.noise_um * 1e-3 * math.sqrt(4.0 ** (s.averaging_code - fewer)) * self._noise.at(t)
         reading = true * (1.0 + s.gain_error) + s.offset_mm + noise

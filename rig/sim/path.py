@@ -6,11 +6,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterable
 
-import numpy as np
-import numpy.typing as npt
-
-Floats = npt.NDArray[np.float64]
-
 HISTORY_S = 5.0  # what is older than this before a new command is forgotten
 
 
@@ -33,7 +28,6 @@ class Path:
         self._x = [x]
         self._v = [0.0]
         self._a = [0.0]
-        self._arrays: tuple[Floats, ...] | None = None
         self.changes = 0
 
     @property
@@ -46,18 +40,6 @@ class Path:
         i = max(bisect_right(self._t, t) - 1, 0)
         dt = t - self._t[i] if i else 0.0
         return self._x[i] + (self._v[i] + 0.5 * self._a[i] * dt) * dt, self._v[i] + self._a[i] * dt
-
-    def sample(self, t: Floats) -> Floats:
-        """Positions at the times ``t`` (n,)."""
-        if self._arrays is None:
-            starts = np.array(self._t)
-            starts[0] = starts[1] if len(starts) > 1 else 0.0  # the first piece is a rest: any finite time will do
-            self._arrays = (np.array(self._t), starts, np.array(self._x), np.array(self._v), np.array(self._a))
-        edges, starts, x, v, a = self._arrays
-        i = np.maximum(np.searchsorted(edges, t, side="right") - 1, 0)
-        dt = t - starts[i]
-        position: Floats = x[i] + (v[i] + 0.5 * a[i] * dt) * dt
-        return position
 
     def follow(self, t: float, pieces: Iterable[tuple[float, float]]) -> None:
         """From time ``t`` on go through ``pieces`` (duration, acceleration), then stand still.
@@ -111,7 +93,6 @@ class Path:
         self._x.append(x)
         self._v.append(v)
         self._a.append(a)
-        self._arrays = None
 
 
 def trapezoid(x: float, v: float, target: float, speed: float, acceleration: float) -> list[tuple[float, float]]:

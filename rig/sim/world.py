@@ -82,7 +82,7 @@ class World:
         self._overstress = [0.0] * len(self._branches)
         self._elastic = 0.0  # F_e at the last tick
         self._tick = 0
-        self._still: tuple[int, int, bool] | None = None
+        self._still: tuple[int, int] | None = None
         self._still_force = 0.0
 
     @property
@@ -92,59 +92,68 @@ class World:
             self._table = tabulate(self.specimen, self._compliance, self._has_hv, self._solve)
         return self._table
 
-    def carriage(self, t: Floats) -> Floats:
-        """True position of the carriage (m) at the times ``t`` (n,), screw error included."""
-        x = self.stage.sample(t)
+    # At one time, for instruments
+
+    def carriage_at(self, t: float) -> float:
+        """True position of the carriage (m), screw error included."""
+        x = self.stage.at(t)[0]
         if self._screw_error:
-            x = x + self._screw_error * np.sin(self._screw_wave * x)
+            x += self._screw_error * math.sin(self._screw_wave * x)
         return x
 
-    def indentation(self, t: Floats) -> Floats:
+    def indentation_at(self, t: float) -> float:
         """How far the carriage is beyond contact (m), never negative."""
-        return np.maximum(self.carriage(t) - self._contact, 0.0)
+        return max(self.carriage_at(t) - self._contact, 0.0)
+
+    def force_at(self, t: float) -> float:
+        """Force of the film on the pusher (N), not more than a tick after the last one."""
+        if self.torn:
+            return 0.0
+        if self._branches:
+            s = self.indentation_at(t)
+            dt = max(t - self._tick * TICK, 0.0)
+            rise = self._elastic_force(s) - self._elastic
+            return self._equilibrium(s, t) + sum(
+                _relax(q, ratio, tau, dt, rise)
+                for q, (ratio, tau) in zip(self._overstress, self._branches, strict=True)
+            )
+        if t < max(self.stage.end, self.output.end):
+            return self._equilibrium(self.indentation_at(t), t)
+        state = (self.stage.changes, self.output.changes)
+        if state != self._still:  # nothing moves any more: one value for all that follows
+            self._still, self._still_force = state, self._equilibrium(self.indentation_at(t), t)
+        return self._still_force
+
+    def displacement_at(self, t: float) -> float:
+        """Displacement of the disk from its flat position (m)."""
+        s = self.indentation_at(t)
+        return s if self.torn else s - self._compliance * self._equilibrium(s, t)
+
+    def _equilibrium(self, s: float, t: float) -> float:
+        return self.film.force_at(s, self.output.at(t)[0]) if s > 0 else 0.0
+
+    def _elastic_force(self, s: float) -> float:
+        return self.film.force_at(s, 0.0) if s > 0 else 0.0
+
+    # At many times, for whoever looks at the truth
+
+    def carriage(self, t: Floats) -> Floats:
+        """`carriage_at` for times ``t`` (n,)."""
+        return np.array([self.carriage_at(time) for time in t.tolist()])
 
     def voltage(self, t: Floats) -> Floats:
-        """Voltage on the electrodes (V)."""
-        return self.output.sample(t)
-
-    def _equilibrium(self, s: Floats, t: Floats) -> Floats:
-        s = np.minimum(s, self.film.reach)
-        return self.film.force(s, self.voltage(t) if self._has_hv else None)
+        """Voltage on the electrodes (V) for times ``t`` (n,)."""
+        return np.array([self.output.at(time)[0] for time in t.tolist()])
 
     def force(self, t: Floats) -> Floats:
-        """Force of the film on the pusher (N) at the times ``t`` (n,), none more than a tick after the last one."""
-        if not self._branches and t[0] >= max(self.stage.end, self.output.end):
-            state = (self.stage.changes, self.output.changes, self.torn)
-            if state != self._still:  # nothing moves: one value for all that follow
-                self._still, self._still_force = state, float(self._force(t[:1])[0])
-            return np.full(t.shape, self._still_force)
-        return self._force(t)
-
-    def _force(self, t: Floats) -> Floats:
-        s = self.indentation(t)
-        if self.torn or not s.any():
-            force = np.zeros_like(s)
-        else:
-            force = self._equilibrium(s, t)
-        if self._branches and not self.torn:
-            start = self._tick * TICK
-            dt = np.maximum(t - start, 0.0)
-            rise = self._elastic_force(s) - self._elastic
-            for q, (ratio, tau) in zip(self._overstress, self._branches, strict=True):
-                force = force + _relax(q, ratio, tau, dt, rise)
-        return force
+        """`force_at` for times ``t`` (n,)."""
+        return np.array([self.force_at(time) for time in t.tolist()])
 
     def displacement(self, t: Floats) -> Floats:
-        """Displacement of the disk from its flat position (m)."""
-        s = self.indentation(t)
-        if self.torn or not s.any():
-            return s
-        return s - self._compliance * self._equilibrium(s, t)
+        """`displacement_at` for times ``t`` (n,)."""
+        return np.array([self.displacement_at(time) for time in t.tolist()])
 
-    def _elastic_force(self, s: Floats) -> Floats:
-        if not s.any():
-            return np.zeros_like(s)
-        return self.film.force(np.minimum(s, self.film.reach))
+    # Electrodes
 
     @property
     def film_resistance(self) -> float:
@@ -180,32 +189,25 @@ class World:
                     self._check_strength(t)
 
     def _one_tick(self, t: float) -> None:
-        time = np.array([t])
-        elastic = float(self._elastic_force(self.indentation(time))[0])
-        rise = np.array([elastic - self._elastic])
-        dt = np.array([TICK])
+        elastic = self._elastic_force(self.indentation_at(t))
+        rise = elastic - self._elastic
         self._overstress = [
-            float(_relax(q, ratio, tau, dt, rise)[0])
-            for q, (ratio, tau) in zip(self._overstress, self._branches, strict=True)
+            _relax(q, ratio, tau, TICK, rise) for q, (ratio, tau) in zip(self._overstress, self._branches, strict=True)
         ]
         self._elastic = elastic
         self._check_strength(t)
 
     def _check_strength(self, t: float) -> None:
-        time = np.array([t])
-        s = self.indentation(time)
-        if s[0] > 0 and s[0] > self.film.reach:
+        s = self.indentation_at(t)
+        if s > 0 and s > self.film.reach:
             self.torn = True
-        if self._has_hv and not self.broken_down:
-            voltage = self.voltage(time)
-            if voltage[0] > 0:
-                self.broken_down = bool(voltage[0] >= self.film.breakdown_voltage(np.minimum(s, self.film.reach))[0])
+        voltage = self.output.at(t)[0]
+        if voltage > 0 and not self.broken_down:
+            self.broken_down = voltage >= self.film.breakdown_voltage_at(s)
 
 
-def _relax(q: float, ratio: float, tau: float, dt: Floats, rise: Floats) -> Floats:
+def _relax(q: float, ratio: float, tau: float, dt: float, rise: float) -> float:
     """Overstress after ``dt`` of an elastic force that rises by ``rise`` at a constant rate."""
-    fraction = dt / tau
-    # (1 - exp(-x))/x, 1 at x = 0
-    mean = np.where(fraction > 0, -np.expm1(-fraction) / np.where(fraction > 0, fraction, 1.0), 1.0)
-    overstress: Floats = q * np.exp(-fraction) + ratio * rise * mean
-    return overstress
+    x = dt / tau
+    mean = -math.expm1(-x) / x if x > 0 else 1.0
+    return q * math.exp(-x) + ratio * rise * mean

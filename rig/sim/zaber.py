@@ -11,8 +11,6 @@ import math
 import re
 from typing import Literal
 
-import numpy as np
-
 from rig.sim.path import trapezoid
 from rig.sim.settings import StageTruth
 from rig.sim.wire import ByteWire
@@ -341,8 +339,7 @@ class ZaberStage:
         if name == "pos":
             return "OK", str(self.position(t))
         if name == "encoder.pos":
-            true = float(self._world.carriage(np.array([t]))[0])
-            return "OK", str(round((true - self._origin) / self._step))
+            return "OK", str(round((self._world.carriage_at(t) - self._origin) / self._step))
         if name == "resolution":
             return "OK", str(round(FULL_STEP_UM / self._settings.microstep_um))
         if name == "peripheralid":

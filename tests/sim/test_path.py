@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,14 +26,16 @@ def test_it_gets_there_within_its_limits(x, v, target, speed, acceleration):
     assert x == pytest.approx(target, abs=1e-9) and v == pytest.approx(0, abs=1e-9)
 
 
-def test_one_sample_is_as_good_as_many():
+def test_it_follows_the_pieces_and_then_a_ramp():
     path = Path(0.01)
-    path.follow(1.0, trapezoid(0.01, 0.0, 0.06, 0.013, 0.2))
-    path.ramp(3.0, 0.0, 0.005)
-    t = np.linspace(0, 20, 997)
-    together = path.sample(t)
-    assert all(path.sample(t[i : i + 1])[0] == together[i] for i in range(len(t)))
-    assert together == pytest.approx([path.at(time)[0] for time in t], abs=1e-15)
+    path.follow(1.0, [(1.0, 0.02), (2.0, 0.0), (1.0, -0.02)])
+    assert path.at(0.5) == (0.01, 0.0)
+    assert path.at(2.0) == pytest.approx((0.02, 0.02))
+    assert path.at(3.0) == pytest.approx((0.04, 0.02))
+    assert path.at(9.0) == pytest.approx((0.07, 0.0)) and path.end == pytest.approx(5.0)
+    path.ramp(10.0, 0.0, 0.01)
+    assert path.at(12.0) == pytest.approx((0.05, -0.01)) and path.end == pytest.approx(17.0)
+    assert path.at(18.0) == (0.0, 0.0)
 
 
 def test_history_is_forgotten_in_time():
@@ -42,4 +43,4 @@ def test_history_is_forgotten_in_time():
     for k in range(1000):
         path.ramp(float(k), float(k % 7), 100.0)
     assert len(path._t) < 4 * HISTORY_S
-    assert path.sample(np.array([998.9, 999.9])) == pytest.approx([998 % 7, 999 % 7])
+    assert path.at(998.9)[0] == pytest.approx(998 % 7) and path.at(999.9)[0] == pytest.approx(999 % 7)
