@@ -374,6 +374,7 @@ class CiA404:
         self._link.close()
 
     def poll(self, now: float) -> Sequence[ForceSample]:
+        self._next_poll = now + self._interval  # a port that is gone is not asked in a busy loop
         frames = self._link.read()
         if self._clock is None and self._dialogue.idle:
             frames = []
@@ -447,10 +448,10 @@ class CiA404:
                 f"no valid process value for {silent_s:.2f} s though the node was started",
                 "Check the device and its cable; it may have been switched off or stopped.",
             )
-        if clock.off_rate:
+        if (rate := clock.other_rate()) is not None:
             raise DeviceRefused(
                 self.name,
-                f"sends at {clock.rate_ratio * self._rate:.4g} Hz although {self._rate:.4g} Hz were set",
+                f"sends at {rate:.4g} Hz although {self._rate:.4g} Hz were set",
                 "Its event timer may be coarser, or the bus loses frames.",
             )
         return samples

@@ -370,6 +370,7 @@ class GSV8:
         self._link.close()
 
     def poll(self, now: float) -> Sequence[ForceSample]:
+        self._next_poll = now + self._interval  # a port that is gone is not asked in a busy loop
         data = self._link.read()
         if self._polls == 0:
             data = b""  # whatever was in the line belongs to an earlier conversation
@@ -423,10 +424,10 @@ class GSV8:
                 f"no valid measured value for {silent_s:.2f} s though the stream was started",
                 "Check the amplifier and its cable; it may have been switched off or reset.",
             )
-        if clock.off_rate:
+        if (rate := clock.other_rate()) is not None:
             raise DeviceRefused(
                 self.name,
-                f"streams at {clock.rate_ratio * self._rate:.4g} Hz although {self._rate:.4g} Hz were set",
+                f"streams at {rate:.4g} Hz although {self._rate:.4g} Hz were set",
                 "The amplifier may have been reset, or the line loses data.",
             )
         return samples

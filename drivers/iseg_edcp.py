@@ -520,11 +520,14 @@ class IsegEDCP:
     # -- polling ----------------------------------------------------------------------------------------------------
 
     def poll(self, now: float) -> Sequence[HVSample]:
+        self._next_poll = now + self._period  # a port that is gone is not asked in a busy loop
         for frame in self._link.read():
             message = self._decoder.feed(frame)
             if isinstance(message, LogOn):
                 self.counters["log_ons"] += 1
                 self._link.write(log_on(self._module))
+                if self._ready:  # it may have been switched off and on, and lost what was set
+                    self._dialogue.begin(self._read_settings())
             elif message is not None and not self._dialogue.offer(message, now) and not self._collect(message):
                 self.counters["unexpected_frames"] += 1
         if self._dialogue.idle:
@@ -630,7 +633,7 @@ class IsegEDCP:
 
     def _set_up(self) -> Script[None]:
         foreign = self.counters["foreign_requests"]
-        module = yield from self._integer(MODULE_STATUS)
+        yield from self._integer(MODULE_STATUS)
         if self.counters["foreign_requests"] != foreign:
             raise DeviceRefused(
                 self.name,
@@ -661,23 +664,30 @@ class IsegEDCP:
                 f"states nominal values of {volts:g} V and {amperes:g} A",
                 "Only positive ones are supported.",
             )
-        setpoint, _ = yield from self._number(SET_VOLTAGE, 2 * volts)
-        limit, _ = yield from self._number(SET_CURRENT, 2 * amperes)
-        ramp, _ = yield from self._number(MODULE_RAMP, 1e3)
-        status = yield from self._integer(CHANNEL_STATUS)
         self._nominal = (volts, amperes)
+        yield from self._read_settings()
+        setpoint, _ = yield from self._number(SET_VOLTAGE, 2 * volts)
+        status = yield from self._integer(CHANNEL_STATUS)
         self.settings |= {
             "nominal_voltage_V": f"{volts:.9g}",
             "nominal_current_A": f"{amperes:.9g}",
-            "ramp_percent_per_s": f"{ramp:.9g}",
-            "ramp_V_per_s": f"{ramp / 100 * volts:.9g}",
-            "current_limit_A": f"{limit:.9g}",
             "setpoint_at_setup_V": f"{setpoint:.9g}",
             "channel_at_setup": "on" if status & ChannelStatus.ON else "off",
-            "kill_enabled": "yes" if module & ModuleStatus.KILL_ENABLED else "no",
             "channels": str(self._channels),
         }
         self._ready = True
+
+    def _read_settings(self) -> Script[None]:
+        volts, amperes = self._nominal
+        limit, _ = yield from self._number(SET_CURRENT, 2 * amperes)
+        ramp, _ = yield from self._number(MODULE_RAMP, 1e3)
+        module = yield from self._integer(MODULE_STATUS)
+        self.settings |= {
+            "ramp_percent_per_s": f"{ramp:.9g}",
+            "ramp_V_per_s": f"{ramp / 100 * volts:.9g}",
+            "current_limit_A": f"{limit:.9g}",
+            "kill_enabled": "yes" if module & ModuleStatus.KILL_ENABLED else "no",
+        }
 
     def _cycle(self, now: float) -> Script[None]:
         volts, amperes = self._nominal

@@ -96,18 +96,22 @@ class SampleClock(Generic[T]):
         """Whether the phase of the stream has been found, some seconds after its start or a gap."""
         return self._acquired
 
-    @property
-    def rate_ratio(self) -> float:
-        """Samples that came in the last seconds over those that the nominal rate would have given; 1 at first."""
-        elapsed = self._now - self._counted_since
-        return self._counted * self._nominal / elapsed if elapsed > 0 else 1.0
+    def other_rate(self) -> float | None:
+        """The rate at which samples really come, if it is quite another than the nominal one; then counts anew.
 
-    @property
-    def off_rate(self) -> bool:
-        """Whether samples come at quite another rate, by more than stalls and what they dam up can explain."""
+        It is another when stalls of half a second and what they dam up cannot explain the samples of the last
+        seconds. Gaps that have been counted do not enter.
+        """
         elapsed, given = self._now - self._counted_since, self._counted * self._nominal
         slack = max(_STALL_S, 3 * self._nominal)
-        return not 0.5 * elapsed - slack <= given <= 1.05 * elapsed + slack
+        if 0.5 * elapsed - slack <= given <= 1.05 * elapsed + slack:
+            return None
+        rate = self._counted / elapsed if elapsed > 0 else math.inf
+        self._count_anew()
+        return rate
+
+    def _count_anew(self) -> None:
+        self._counted_since, self._counted = self._now, 0
 
     def feed(self, now: float, samples: list[T]) -> list[tuple[float, T]]:
         """Take the samples that have arrived by ``now``, oldest first; return those whose times are settled."""
@@ -116,8 +120,8 @@ class SampleClock(Generic[T]):
             return []
         self._counted += len(samples)
         if self._last is None:
-            self._last = self._counted_since = now
-            self._counted = 0
+            self._last = now
+            self._count_anew()
             self._open_window(now)
             return [(now - (len(samples) - 1 - i) * self._period, sample) for i, sample in enumerate(samples)]
         self._held += samples
@@ -149,6 +153,7 @@ class SampleClock(Generic[T]):
         if gap:
             self._acquired = False
             self._open_window(now)
+            self._count_anew()
         else:
             self._track(now, n, late)
         return stamped
@@ -203,6 +208,6 @@ class SampleClock(Generic[T]):
             self._period = min(max(period, low), high)
         self._last += min(_PHASE_GAIN * self._window_least, 0.5 * self._nominal)
         self._acquired = True
-        if now - self._counted_since > _COUNT_S and not self.off_rate:
-            self._counted_since, self._counted = now, 0
+        if now - self._counted_since > _COUNT_S:
+            self._count_anew()
         self._open_window(now)

@@ -1,114 +1,103 @@
-"""Single-channel HV supply of the Peta-pico-Voltron project (shvps), as used in DEA laboratories: text on 115200 8N1.
+r"""The peta-pico-Voltron single-channel HV supply (shvps, up to 5 kV) of dielectric-elastomer labs, serial, 115200 8N1.
 
-A command ends with CR, and every command is answered with one line: a query with the value, a setting with the value
-that now holds, anything else with ``Err``. Volts are whole numbers. Used here::
+A command is a word and perhaps a number, ended by CR; one line ended by CR LF comes back, which is the value alone:
+``QVnow\r`` -> ``1498\r\n``. ``Q..`` asks, ``S.. n`` sets and answers with the new value. Voltages are whole volts.
+``SSwMode`` is the state of the output: 0 off (0 V whatever the set-point), 1 steady, 2 switching, 3 waveform;
+``SVMode`` 0 means regulated to the set-point, ``SSwSrc`` 0 that the board itself switches.
 
-    QVer -> slave 8      kind ("slave" is the single-channel supply) and firmware    QName -> its name
-    QVmax                rating                   QVset, SVset n    set-point        QVnow      measured voltage
-    QSwMode, SSwMode n   0 off, 1 DC, 2 switching between 0 and set-point, 3 waveform
-    QSwSrc, SSwSrc n     what switches: 0 the board, 1 an input, 2 the push button
-    QVMode, SVMode n     0 regulated, 1 by a control voltage, 2 open loop
-    QPowJack, QJack      whether power is to come from the jack, and whether it is plugged in
+**What the protocol lacks, and what stands in for it.**
+No line says what it answers, and numbers look alike. After each number the driver asks for the version, whose answer
+(``slave 8``) looks like no number: a doubled or late number meets that question and is dropped, and since answers
+keep their order no old one can come after it.
+There is no checksum: a digit may change unseen. Commands are read back; a voltage above 1.2 times the maximum is not
+believed.
+There is no ramp: the set-point is moved in steps at the polling rate. When the host dies, the voltage stays.
+The current is not measured (NaN) and not limited beyond what the converter can give: `set_current_limit` refuses.
+There is no latch: an emergency off is remembered here, until `clear`.
 
-Sources: petapicovoltron.com, "Direct communication with the HVPS"; hvps.py 2.8 of the same project.
-
-What this supply lacks
-    It measures no current and has no current limit but what its converter can give; it has no ramp, no trip, no latched
-    emergency off and no watchdog: when the host dies, the voltage stays. The driver makes ramp and latch itself, out of
-    steps at its poll rate, and reports the current as NaN. There is no checksum: a digit lost or changed on the line is
-    a wrong number, noticed only where it answers a setting or exceeds the rating. Answers do not name their command,
-    so after one that had to be repeated the line must stay quiet for one timeout before the next.
+Source: EPFL NERDv3, libs/hvps.py (library 2.8, firmware 8). Not tried on hardware.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
-from drivers.dialogue import Answer, Ask, Dialogue
-from drivers.link import ByteLink, DeviceError, DeviceRefused
+from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, Identity
 
 T = TypeVar("T")
 
-OFF, DC = 0, 1
-ONBOARD = 0
-REGULATED = 0
+OFF, STEADY, SWITCHING, WAVEFORM = range(4)
 
-MAX_LINE = 80
-_NUMBER = re.compile(rb"[0-9]{1,5}")
-_PRINTABLE = re.compile(rb"[ -~]*")
-_ATTEMPTS = 3
+TRIES = 3
+PLAUSIBLE = 1.2
+LONGEST_STEP_S = 0.25
+"""A ramp does not make up for time in which nobody polled."""
+
+_MAX_LINE = 64
+_NUMBER = re.compile(r"-?[0-9]{1,6}")
+_VERSION = re.compile(r"([a-z]{3,12}) ([0-9]{1,4})")
+_UNSAFE = "Take the high voltage away by hand: pull the power jack, then ground the electrodes."
+
+_Part = Generator[Ask[str], Answer[str], T]
 
 
-class Decoder:
-    """Bytes to lines. Never raises; holds back less than `MAX_LINE` bytes.
+def encode(command: str) -> bytes:
+    return command.encode("ascii") + b"\r"
 
-    Lines end with CR, LF or both. Counters: ``dropped_bytes``, of lines that are too long or not printable ASCII.
-    """
+
+class Codec:
+    """Bytes to lines of printable ASCII. ``counters``: ``bad_grammar``, ``too_long``."""
 
     def __init__(self, counters: dict[str, int] | None = None) -> None:
         self.counters = {} if counters is None else counters
-        self.counters.setdefault("dropped_bytes", 0)
-        self._buffer = b""
-        self._overlong = False
+        for key in ("bad_grammar", "too_long"):
+            self.counters.setdefault(key, 0)
+        self._buffer = bytearray()
+        self._skipping = False
 
-    def feed(self, data: bytes) -> list[bytes]:
-        """Lines completed by ``data``, without their ends; empty ones are left out."""
-        *lines, rest = (self._buffer + data).replace(b"\n", b"\r").split(b"\r")
-        good = []
-        for line in lines:
-            if self._overlong or len(line) > MAX_LINE or not _PRINTABLE.fullmatch(line):
-                self.counters["dropped_bytes"] += len(line)
-                self._overlong = False
-            elif line:
-                good.append(line)
-        if self._overlong or len(rest) > MAX_LINE:
-            self.counters["dropped_bytes"] += len(rest)
-            self._overlong, rest = True, b""
+    def feed(self, data: bytes) -> list[str]:
+        """The lines that ``data`` completes, in order."""
+        lines: list[str] = []
+        self._buffer += data
+        *complete, rest = self._buffer.split(b"\n")
+        for line in complete:
+            if self._skipping:
+                self._skipping = False
+            elif len(line) > _MAX_LINE:
+                self.counters["too_long"] += 1
+            elif re.fullmatch(rb"[ -~]+\r", line):
+                lines.append(line[:-1].decode("ascii"))
+            else:
+                self.counters["bad_grammar"] += 1
+        if len(rest) > _MAX_LINE:
+            self.counters["too_long"] += not self._skipping
+            self._skipping = True
+            rest = bytearray()
         self._buffer = rest
-        return good
+        return lines
 
 
-def encode(command: str, value: int | None = None) -> bytes:
-    """One command with its end."""
-    return (command if value is None else f"{command} {value}").encode("ascii") + b"\r"
-
-
-@dataclass(frozen=True, slots=True)
-class _Request:
-    data: bytes
-    number: bool = True  # what a good answer looks like
-
-    def __str__(self) -> str:
-        return self.data.decode("ascii").strip().replace("\r", ", ")
-
-
-Script = Generator[Ask[_Request], Answer[bytes], T]
-
-
-class SHVPS:
-    """The supply as an `drivers.roles.HVSupply`.
-
-    Set-up only asks. ``set_voltage`` names where the set-point is to go; it goes there in steps at ``poll_rate_Hz``
-    once the channel is on. ``switch_off`` takes it down the same way and then switches off. ``emergency_off`` switches
-    off at once and is remembered until `clear`. A channel that is found off though it was switched on (a reset, a
-    button) shows as ``TRIPPED`` until `clear` and is not switched on again by itself.
+class Shvps:
+    """A `drivers.roles.HVSupply`. Set-up asks and changes nothing.
 
     Parameters
     ----------
+    name : str
+        The device's name in the scene.
+    link : ByteLink
+        Its serial line.
     poll_rate_Hz : float
-        Samples per second, and steps of the ramp.
+        How often voltage and state are asked for; also the rate of the ramp's steps.
     timeout_s : float
         How long to wait for each answer.
     ramp_V_per_s : float
         Ramp until `set_ramp` says otherwise.
-    max_current_A : float, optional
-        What the converter can give at most, from its data sheet. The supply neither limits nor measures current; a
-        limit is accepted only if the supply could not exceed it anyway.
     """
 
     def __init__(
@@ -116,40 +105,30 @@ class SHVPS:
         name: str,
         link: ByteLink,
         *,
-        poll_rate_Hz: float = 10.0,
-        timeout_s: float = 0.25,
-        ramp_V_per_s: float = 200.0,
-        max_current_A: float | None = None,
+        poll_rate_Hz: float = 20.0,
+        timeout_s: float = 0.1,
+        ramp_V_per_s: float = 100.0,
     ) -> None:
-        if not 0 < poll_rate_Hz <= 100:
-            raise DeviceRefused(name, f"poll rate {poll_rate_Hz} Hz is not possible", "Allowed: above 0, at most 100.")
-        if max_current_A is not None and not 0 < max_current_A <= 1:
-            raise DeviceRefused(name, f"a converter of {max_current_A} A is not possible", "Allowed: above 0 to 1 A.")
         self.name = name
-        self.identity = Identity(model="shvps")
+        self.identity = Identity()
         self.settings: dict[str, str] = {}
-        self.counters: dict[str, int] = {"unexpected_answers": 0, "refused_answers": 0, "bad_values": 0}
+        self.counters: dict[str, int] = {"implausible": 0, "unexpected_replies": 0}
+        self._label = label(name, link)
         self._link = link
-        self._period = 1.0 / poll_rate_Hz
-        self._timeout = timeout_s
-        self._nominal = (math.nan, math.nan if max_current_A is None else max_current_A)
-        self._decoder = Decoder(self.counters)
-        self._dialogue: Dialogue[_Request, bytes] = Dialogue(name, self._transmit, self.counters, timeout_s=timeout_s)
-        self._settle_s = 0.0
-        self._ready = False
-        self._on = False  # whether we switched it on
-        self._leaving = False  # on the way down to be switched off
-        self._target = 0.0
-        self._latched = HVFlag(0)
-        self._commands = 0
-        self._bad_in_a_row = 0
-        self._stepped = -math.inf
+        self._codec = Codec(self.counters)
+        self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
+        self._dialogue: Dialogue[str, str] = Dialogue(self._label, self._send, self.counters, timeout_s=timeout_s)
+        self._inbox: deque[str] = deque()
         self._samples: list[HVSample] = []
-        self._next_cycle = -math.inf
-        self._next_poll = -math.inf
-        self.set_ramp(ramp_V_per_s)
-
-    # -- role -------------------------------------------------------------------------------------------------------
+        self._now = self._next_poll = 0.0
+        self._ready = False
+        self._commands = 0
+        self._max_volts = math.nan
+        self._ramp = ramp_V_per_s
+        self._target = self._setpoint = 0
+        self._stepped_at = -math.inf
+        self._on = self._emergency = False
+        self._dialogue.begin(self._set_up())
 
     @property
     def ready(self) -> bool:
@@ -161,261 +140,242 @@ class SHVPS:
 
     @property
     def nominal(self) -> tuple[float, float]:
-        """(rated volts, amperes as stated by the user); NaN where not known."""
-        return self._nominal
+        """(volts, NaN): what current the converter can give is not known to it."""
+        return self._max_volts, math.nan
 
     @property
     def busy(self) -> bool:
         return self._commands > 0
 
     def set_ramp(self, volts_per_second: float) -> None:
-        if not 0 < volts_per_second <= 1e5:
-            raise DeviceRefused(
-                self.name, f"a ramp of {volts_per_second:g} V/s is not possible", "Allowed: above 0, at most 1e5 V/s."
-            )
+        self._require_ready()
+        if not 0 < volts_per_second < math.inf:
+            raise DeviceRefused(self._label, f"{volts_per_second:g} V/s is no ramp", "Give one above zero.")
         self._ramp = volts_per_second
-        self.settings["ramp_V_per_s"] = f"{volts_per_second:.9g}"
 
     def set_current_limit(self, amperes: float) -> None:
-        limit = self._nominal[1]
-        if not (amperes >= limit):
-            stated = "is not stated" if math.isnan(limit) else f"is {limit:g} A"
-            raise DeviceRefused(
-                self.name,
-                f"cannot limit its current to {amperes:g} A; what its converter can give {stated}",
-                "State max_current_A, or put a limiting resistor in and state what it lets through.",
-            )
+        raise DeviceRefused(
+            self._label,
+            "this supply has no current limit that could be set",
+            "Leave the current limit out of the scene, and limit the current with a resistor.",
+        )
 
     def set_voltage(self, volts: float) -> None:
-        self._require_ready("set the voltage")
-        if not 0.0 <= volts <= self._nominal[0]:
+        self._require_ready()
+        if not 0 <= volts <= self._max_volts:
             raise DeviceRefused(
-                self.name,
-                f"a set-point of {volts:g} V is outside the supply's range",
-                f"Allowed: 0 to {self._nominal[0]:g} V.",
+                self._label,
+                f"a set-point of {volts:g} V is outside its range",
+                f"Allowed: 0 to {self._max_volts:g} V.",
             )
         if volts != round(volts):
-            raise DeviceRefused(self.name, f"a set-point of {volts:g} V is no whole number", "It knows whole volts.")
-        self._target = volts
-        self._command(self._cycle())
+            raise DeviceRefused(self._label, f"a set-point of {volts!r} V is no whole number", "Give whole volts.")
+        self._command(self._aim(round(volts)))
 
     def switch_on(self) -> None:
-        self._require_ready("switch on")
-        if self._latched:
+        """Switch on at 0 V; the output then ramps to the set-point."""
+        self._require_ready()
+        if self._emergency:
             raise DeviceRefused(
-                self.name, f"is not switched on while {_names(self._latched)} is latched", "Find the cause, then clear."
+                self._label, "it is not switched on after an emergency off", "Find the cause, then clear."
             )
         self._command(self._switch_on())
 
     def switch_off(self) -> None:
-        self._leaving = True
-        self._command(self._cycle())
+        self._require_ready()
+        self._command(self._switch_off())
 
     def emergency_off(self) -> None:
         self._dialogue.clear()
         self._commands = 0
-        self._on = self._leaving = False
-        self._latched |= HVFlag.EMERGENCY_OFF
-        self._settle_s = 0.0  # it waits for nothing
+        self._emergency = True
+        self._target = 0
         self._command(self._emergency_off())
+        if not self._ready:
+            self._dialogue.begin(self._set_up())
 
     def clear(self) -> None:
-        self._command(self._clear())
+        self._emergency = False
+
+    def poll(self, now: float) -> Sequence[HVSample]:
+        self._now = now
+        try:
+            self._inbox.extend(self._codec.feed(self._link.read()))
+            while self._inbox:
+                if not self._dialogue.offer(self._inbox.popleft(), now):
+                    self.counters["unexpected_replies"] += 1
+            if self._ready and self._dialogue.idle and self._schedule.take(now):
+                self._dialogue.begin(self._cycle())
+            self._dialogue.run(now)
+        except DeviceLost:
+            self._next_poll = now + LOST_AGAIN_S
+            raise
+        except DeviceError:
+            self._next_poll = now
+            raise
+        due = self._schedule.due if self._dialogue.idle else math.inf
+        self._next_poll = min(self._dialogue.next_poll(now), due)
+        samples, self._samples = self._samples, []
+        return samples
 
     def close(self) -> None:
         self._link.close()
 
-    # -- polling ----------------------------------------------------------------------------------------------------
+    def _send(self, request: str) -> Callable[[str], bool]:
+        self._link.write(encode(request))
+        if request == "QVer":
+            return lambda line: _VERSION.fullmatch(line) is not None
+        if request == "QName":
+            return lambda line: _VERSION.fullmatch(line) is None
+        limit = PLAUSIBLE * self._max_volts if request == "QVnow" else math.inf
+        return lambda line: self._is_number(line, limit)
 
-    def poll(self, now: float) -> Sequence[HVSample]:
-        for line in self._decoder.feed(self._link.read()):
-            if not self._dialogue.offer(line, now):
-                self.counters["unexpected_answers"] += 1
-        if self._dialogue.idle:
-            if not self._ready:
-                self._dialogue.begin(self._set_up())
-            elif now >= self._next_cycle:
-                beat = self._next_cycle + self._period
-                self._next_cycle = beat if beat > now else now + self._period
-                self._dialogue.begin(self._cycle())
+    def _is_number(self, line: str, limit: float) -> bool:
+        if not _NUMBER.fullmatch(line):
+            return False
+        if abs(int(line)) > limit:
+            self.counters["implausible"] += 1
+            return False
+        return True
+
+    def _ask(self, request: str) -> _Part[Answer[str]]:
+        """The answer to a request that may be repeated, followed by the question whose answer is unlike any other."""
+        for last in (False,) * (TRIES - 1) + (True,):
+            try:
+                answer = yield Ask(request, repeat=False)
+            except DeviceSilent:
+                if last:
+                    raise
+                self.counters["retries"] += 1
+                yield Ask("QVer")
+            else:
+                yield Ask("QVer")
+                return answer
+        raise AssertionError("unreachable")
+
+    def _number(self, request: str) -> _Part[int]:
+        return int((yield from self._ask(request)).message)
+
+    def _set(self, word: str, value: int) -> _Part[None]:
+        """Set, and read back by another question."""
+        yield from self._number(f"S{word} {value}")
+        for _ in range(TRIES):
+            read_back = yield from self._number(f"Q{word}")
+            if read_back == value:
+                return
+        raise DeviceRefused(
+            self._label,
+            f"{word} reads back as {read_back} after {value} was set",
+            "Check that no other program, button or external input controls it.",
+        )
+
+    def _set_up(self) -> Script[str, str]:
+        version = _VERSION.fullmatch((yield Ask("QVer")).message)
+        assert version is not None
+        if version[1] != "slave":
+            raise DeviceRefused(
+                self._label, f"it is a {version[1]}, not a single-channel supply", "Connect the supply itself."
+            )
+        name = (yield from self._ask("QName")).message
+        max_volts = yield from self._number("QVmax")
+        setpoint = yield from self._number("QVset")
+        mode = yield from self._number("QSwMode")
+        needs_jack = yield from self._number("QPowJack")
+        jack = yield from self._number("QJack")
+        if not 0 < max_volts <= 20_000:
+            raise DeviceRefused(self._label, f"it states a maximum of {max_volts} V", "Check its configuration.")
+        self._jack_missing = bool(needs_jack) and not jack
+        self.identity = Identity(model=f"shvps {name}", firmware=version[2])
+        self._max_volts = float(max_volts)
+        self._setpoint = self._target = setpoint
+        self._on = mode != OFF
+        self.settings |= {
+            "name": name,
+            "firmware": version[2],
+            "maximum_V": str(max_volts),
+            "setpoint_at_setup_V": str(setpoint),
+            "output_at_setup": "off" if mode == OFF else f"mode {mode}",
+            "power_jack": "missing" if self._jack_missing else "in order",
+        }
+        self._schedule.start(self._now)
+        self._ready = True
+
+    def _cycle(self) -> Script[str, str]:
+        if self._on and self._setpoint != self._target:
+            yield from self._step()
+        answer = yield from self._ask("QVnow")
+        self._setpoint = yield from self._number("QVset")
+        mode = yield from self._number("QSwMode")
+        self._on = mode != OFF
+        flags = HVFlag(0)
+        if self._on:
+            flags |= HVFlag.ON
+        if self._on and self._setpoint != self._target:
+            flags |= HVFlag.RAMPING
+        if self._emergency:
+            flags |= HVFlag.EMERGENCY_OFF
+        if self._jack_missing:
+            flags |= HVFlag.FAULT
+        self._samples.append(HVSample(answer.t, float(answer.message), math.nan, float(self._setpoint), flags))
+
+    def _step(self) -> _Part[None]:
+        """Move the set-point towards the target by what the ramp allows since the last step; at least one volt."""
+        elapsed = min(self._now - self._stepped_at, LONGEST_STEP_S)
+        room = max(1, int(self._ramp * elapsed))
+        change = max(-room, min(room, self._target - self._setpoint))
+        if room > self._ramp * elapsed:
+            return  # not yet a volt's time
+        self._stepped_at = self._now
+        yield from self._set("Vset", self._setpoint + change)
+        self._setpoint += change
+
+    def _aim(self, volts: int) -> Script[str, str]:
+        if not self._on:
+            yield from self._set("Vset", 0)
+            self._setpoint = 0
+        self._target = volts
+        self._stepped_at = self._now
+
+    def _switch_on(self) -> Script[str, str]:
+        if self._on:
+            return
+        if self._jack_missing:
+            raise DeviceRefused(self._label, "its power jack is not plugged in", "Plug it in and start again.")
+        for word, value in (("Vset", 0), ("VMode", 0), ("SwSrc", 0), ("SwMode", STEADY)):
+            yield from self._set(word, value)
+        self._setpoint, self._on = 0, True
+        self._stepped_at = self._now
+
+    def _switch_off(self) -> Script[str, str]:
+        self._target = 0
+        self._stepped_at = self._now
+        while self._on and self._setpoint > 0:
+            yield from self._cycle()
+        yield from self._set("SwMode", OFF)
+        self._on = False
+
+    def _emergency_off(self) -> Script[str, str]:
         try:
-            self._dialogue.run(now)
-        finally:
-            self._next_poll = self._next_cycle if self._dialogue.idle else self._dialogue.next_poll(now)
-        samples, self._samples = self._samples, []
-        return samples
+            for request in ("SSwMode 0", "SVset 0"):  # both are on their way before anything is waited for
+                self._link.write(encode(request))
+            yield Ask("QVer")
+            yield from self._set("SwMode", OFF)
+            yield from self._set("Vset", 0)
+        except DeviceError as error:
+            raise type(error)(self._label, f"EMERGENCY OFF IS NOT CONFIRMED ({error.what})", _UNSAFE) from error
+        self._on, self._setpoint = False, 0
 
-    def _command(self, script: Script[None]) -> None:
+    def _command(self, script: Script[str, str]) -> None:
         self._commands += 1
         self._dialogue.begin(self._tracked(script))
-        self._next_poll = -math.inf
+        self._next_poll = self._now
 
-    def _tracked(self, script: Script[None]) -> Script[None]:
+    def _tracked(self, script: Script[str, str]) -> Script[str, str]:
         try:
             yield from script
-        except DeviceError:
-            self._dialogue.clear()
-            self._commands = 0
-            raise
         finally:
             self._commands = max(0, self._commands - 1)
 
-    def _require_ready(self, what: str) -> None:
+    def _require_ready(self) -> None:
         if not self._ready:
-            raise DeviceRefused(self.name, f"cannot {what} before the set-up dialogue has ended", "Poll it first.")
-
-    def _transmit(self, request: _Request) -> Callable[[bytes], bool]:
-        self._link.write(request.data)
-        if not request.number:
-            return lambda line: True
-        return lambda line: line == b"Err" or _NUMBER.fullmatch(line) is not None
-
-    # -- dialogue ---------------------------------------------------------------------------------------------------
-
-    def _ask(self, request: _Request, *, delay_s: float = 0.0) -> Script[tuple[bytes, float]]:
-        """(line, time)."""
-        delay_s, self._settle_s = max(delay_s, self._settle_s), self._timeout  # in case this one goes wrong
-        retries = self.counters["retries"]
-        answer = yield Ask(request, delay_s=delay_s)
-        if self.counters["retries"] == retries:
-            self._settle_s = 0.0
-        if answer.message == b"Err":
-            self.counters["refused_answers"] += 1
-            raise DeviceRefused(self.name, f"does not understand {str(request)!r}", "Its firmware may be too old.")
-        return answer.message, answer.t
-
-    def _number(self, command: str, value: int | None = None, *, delay_s: float = 0.0) -> Script[int]:
-        line, _ = yield from self._ask(_Request(encode(command, value)), delay_s=delay_s)
-        return int(line)
-
-    def _write(self, command: str, value: int) -> Script[None]:
-        """Set; the answer says what holds now."""
-        for _ in range(_ATTEMPTS):
-            if (read_back := (yield from self._number(command, value))) == value:
-                return
-        raise DeviceRefused(
-            self.name,
-            f"answers {read_back} to '{command} {value}'",
-            "It does not accept the value: check its settings.",
-        )
-
-    def _set_up(self) -> Script[None]:
-        version, _ = yield from self._ask(_Request(encode("QVer"), number=False))
-        kind, _, firmware = version.decode("ascii").partition(" ")
-        if kind != "slave":
-            raise DeviceRefused(
-                self.name, f"is no single-channel supply: it calls itself {kind!r}", "Check the port in the scene."
-            )
-        label, _ = yield from self._ask(_Request(encode("QName"), number=False))
-        self.identity = Identity(model="shvps", serial=label.decode("ascii"), firmware=firmware)
-        rating = yield from self._number("QVmax")
-        if not 0 < rating <= 20_000:
-            raise DeviceRefused(self.name, f"states a rating of {rating} V", "Check the instrument.")
-        setpoint = yield from self._number("QVset")
-        mode = yield from self._number("QSwMode")
-        source = yield from self._number("QSwSrc")
-        control = yield from self._number("QVMode")
-        self._jack = bool((yield from self._number("QPowJack")))
-        self._nominal = (float(rating), self._nominal[1])
-        self.settings |= {
-            "nominal_voltage_V": str(rating),
-            "setpoint_at_setup_V": str(setpoint),
-            "channel_at_setup": "off" if mode == OFF else "on",
-            "switching_source": str(source),
-            "voltage_control": str(control),
-        }
-        self._ready = True
-
-    def _cycle(self) -> Script[None]:
-        line, t = yield from self._ask(_Request(encode("QVnow")))
-        setpoint = yield from self._number("QVset")
-        mode = yield from self._number("QSwMode")
-        plugged = not self._jack or bool((yield from self._number("QJack")))
-        if self._on and mode == OFF:
-            self._on = self._leaving = False
-            self._latched |= HVFlag.TRIPPED
-        if not (int(line) <= 1.2 * self._nominal[0] and setpoint <= self._nominal[0]):
-            self.counters["bad_values"] += 1
-            self._bad_in_a_row += 1
-            if self._bad_in_a_row < _ATTEMPTS:
-                return
-            raise DeviceRefused(
-                self.name,
-                f"reports {int(line)} V with a set-point of {setpoint} V, beyond its rating of {self._nominal[0]:g} V",
-                "Switch off by hand and check the supply.",
-            )
-        self._bad_in_a_row = 0
-        flags = self._latched
-        if mode != OFF:
-            flags |= HVFlag.ON
-        if not plugged:
-            flags |= HVFlag.FAULT
-        goal = 0.0 if self._leaving else self._target
-        if (self._on or self._leaving) and mode != OFF and setpoint != goal:
-            flags |= HVFlag.RAMPING
-        self._samples.append(HVSample(t, float(int(line)), math.nan, float(setpoint), flags))
-        if self._leaving:
-            yield from self._go_down(mode, setpoint, t)
-        elif self._on and setpoint != goal:
-            yield from self._step(setpoint, goal, t)
-
-    def _step(self, setpoint: int, goal: float, t: float) -> Script[None]:
-        """One step of the ramp: as far as the time since the last one allows, but no leap after a long pause."""
-        elapsed = min(t - self._stepped, max(2 * self._period, 1.0 / self._ramp))
-        reach = self._ramp * elapsed
-        if reach < 1.0:
-            return
-        self._stepped = t
-        step = min(reach, goal - setpoint) if goal > setpoint else -min(reach, setpoint - goal)
-        yield from self._write("SVset", setpoint + int(step))
-
-    def _go_down(self, mode: int, setpoint: int, t: float) -> Script[None]:
-        if mode != OFF and setpoint > 0:
-            yield from self._step(setpoint, 0.0, t)
-            return
-        self._on = self._leaving = False
-        self._target = 0.0
-        if mode != OFF:
-            yield from self._write("SSwMode", OFF)
-
-    def _switch_on(self) -> Script[None]:
-        mode = yield from self._number("QSwMode")
-        if mode == OFF:
-            # From nothing, by its own regulator, at once: a stored set-point must not jump to the output.
-            yield from self._write("SVset", 0)
-            yield from self._write("SSwSrc", ONBOARD)
-            yield from self._write("SVMode", REGULATED)
-            yield from self._write("SSwMode", DC)
-        elif mode != DC:
-            raise DeviceRefused(self.name, "is already on, but not with a constant voltage", "Switch it off first.")
-        self._on, self._leaving = True, False
-
-    def _emergency_off(self) -> Script[None]:
-        off = _Request(encode("SSwMode", OFF) + encode("SVset", 0), number=False)
-        error: DeviceError | None = None
-        for _ in range(_ATTEMPTS):
-            try:
-                # The next line may still answer what was asked before; only a fresh question shows the state.
-                yield Ask(off)
-                if (yield from self._number("QSwMode", delay_s=self._timeout)) == OFF:
-                    self._target = 0.0
-                    return
-            except DeviceError as failed:
-                error = failed
-        what = error.what if error is not None else "it still says that it is on"
-        raise DeviceRefused(
-            self.name,
-            f"EMERGENCY OFF IS NOT CONFIRMED ({what})",
-            "Take the high voltage away by hand: pull the supply's plug, then ground the electrodes.",
-        )
-
-    def _clear(self) -> Script[None]:
-        yield from self._write("SSwMode", OFF)
-        yield from self._write("SVset", 0)
-        self._on = self._leaving = False
-        self._target = 0.0
-        self._latched = HVFlag(0)
-
-
-def _names(flags: HVFlag) -> str:
-    return " ".join(str(flag.name) for flag in flags)
+            raise DeviceRefused(self._label, "the supply is not set up yet", "Poll it until it is ready.")

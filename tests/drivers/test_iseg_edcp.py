@@ -613,8 +613,10 @@ def test_a_bus_that_returns_own_frames_is_refused() -> None:
 
 def test_a_module_that_lost_its_registration_is_registered_again() -> None:
     rig = Rig().until_ready()
+    rig.module.set(edcp.SET_CURRENT, 2e-4)  # and what it had been set to
     rig.module.inbox.append(frame("201# D8 76 05"))
     rig.run(0.1)
+    assert float(rig.hv.settings["current_limit_A"]) == pytest.approx(2e-4)
     assert rig.writes == [edcp.log_on(0)]
     assert rig.hv.counters["log_ons"] == 1
 
