@@ -1,0 +1,344 @@
+"""Load-cell and HV drivers on their simulated instruments, with every fault switch: what must happen.
+
+The instruments move in virtual time. The film is slack and the load cell's noise is off, so that its true reading is
+one number; the supply is on at 1000 V.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from drivers.gsv8 import GSV8
+from drivers.iseg_edcp import IsegEDCP
+from drivers.link import DeviceError, DeviceLost, DeviceSilent
+from drivers.roles import ForceSample, HVFlag, HVSample, SampleFlag
+from model.materials import NAMED
+from model.specimen import Specimen
+from rig.clock import VirtualClock
+from rig.memory_link import MemoryByteLink, MemoryFrameLink
+from rig.sim.bench import SimulatedBench
+from rig.sim.settings import Fault, ForceTruth, SimulationSettings
+from rig.sim.wire import ByteWire, FrameWire
+
+SPECIMEN = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
+TRUE_READING = 0.013  # mV/V: the simulated cell's zero offset
+VOLTS = 1000.0
+
+
+class Rig:
+    """Load cell and supply, set up; errors are kept with their time."""
+
+    def __init__(self, *, on: bool) -> None:
+        settings = SimulationSettings(
+            seed=1, force=ForceTruth(noise_fraction=0.0, zero_offset_mV_per_V=TRUE_READING, stored_rate_Hz=100.0)
+        )
+        self.bench = SimulatedBench(settings, SPECIMEN, {"force", "hv"})
+        self.clock = VirtualClock(self.bench.advance)
+        line, bus = self.bench.wire("force"), self.bench.wire("hv")
+        assert isinstance(line, ByteWire) and isinstance(bus, FrameWire)
+        self.force = GSV8("force", MemoryByteLink("force", line, self.clock))
+        self.hv = IsegEDCP("hv", MemoryFrameLink("hv", bus, self.clock))
+        self.errors: list[tuple[float, DeviceError]] = []
+        self.forces: list[ForceSample] = []
+        self.outputs: list[HVSample] = []
+        self.run(0.5)
+        assert self.force.ready and self.hv.ready
+        if on:
+            self.hv.set_ramp(1200.0)
+            self.hv.set_current_limit(1e-4)
+            self.hv.set_voltage(VOLTS)
+            self.hv.switch_on()
+            self.run(2.0)
+            assert self.outputs[-1].voltage == pytest.approx(VOLTS, abs=3)
+        assert not self.errors
+        self.forces.clear()
+        self.outputs.clear()
+
+    @property
+    def t(self) -> float:
+        return self.clock.now()
+
+    def inject(self, role: str, kind: str, **keys: object) -> None:
+        self.bench.inject(Fault.model_validate({"role": role, "kind": kind, "at_s": self.t} | keys))
+
+    def run(self, seconds: float) -> None:
+        end = self.t + seconds
+        while self.t < end:
+            due = min(self.force.next_poll, self.hv.next_poll)
+            self.clock.sleep_until(min(end, max(due, self.t + 1e-5)))
+            for device, samples in ((self.force, self.forces), (self.hv, self.outputs)):
+                if self.t < device.next_poll:  # type: ignore[attr-defined]
+                    continue
+                try:
+                    samples += device.poll(self.t)  # type: ignore[operator]
+                except DeviceError as error:
+                    self.errors.append((self.t, error))
+
+    def settle(self, seconds: float = 3.0) -> None:
+        end = self.t + seconds
+        while self.hv.busy and self.t < end:
+            self.run(0.01)
+        assert not self.hv.busy
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig(on=False)
+
+
+@pytest.fixture
+def live() -> Rig:
+    return Rig(on=True)
+
+
+def kinds(errors: Sequence[tuple[float, DeviceError]]) -> set[type[DeviceError]]:
+    return {type(error) for _, error in errors}
+
+
+# The load cell's wire -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"), [("delay", 0.05), ("split", None), ("merge", None), ("drop", None), ("duplicate", None)]
+)
+def test_bad_wire_from_the_load_cell(rig: Rig, kind: str, value: float | None) -> None:
+    """Readings are right, times increase and stay below the present; what is missing is counted."""
+    rig.inject("force", kind, probability=0.05, value=value, duration_s=3.0)
+    rig.run(4.0)
+    assert not rig.errors
+    assert {round(s.reading, 6) for s in rig.forces} == {TRUE_READING}
+    assert not any(s.flags for s in rig.forces)
+    assert all(b.t > a.t for a, b in itertools.pairwise(rig.forces))
+    assert rig.forces[-1].t <= rig.t
+    lost = rig.force.counters["lost_samples"]
+    if kind == "drop":
+        assert 400 - len(rig.forces) == pytest.approx(lost, abs=1)
+        assert lost > 5
+    elif kind == "duplicate":  # no counter in the frame: a double cannot be told from a sample
+        assert len(rig.forces) > 400
+    else:
+        assert lost == 0
+        assert len(rig.forces) == pytest.approx(400, abs=1)
+
+
+def test_corrupt_bytes_from_the_load_cell(rig: Rig) -> None:
+    """There is no checksum: a bit in the value may change unseen. All else is dropped or shows as a flag."""
+    rig.inject("force", "corrupt", probability=0.5)
+    rig.run(20.0)
+    right = [round(s.reading, 6) == TRUE_READING for s in rig.forces]
+    assert sum(right) > 0.92 * len(right)  # 1 of 2 frames, 4 of 36 bytes
+    assert all(abs(s.reading) <= 2 * 3.5 for s in rig.forces if not s.flags)
+    assert rig.force.counters["bad_frames"] > 10
+    assert rig.force.counters["dropped_bytes"] > 100
+    assert not rig.errors
+
+
+def test_silent_load_cell_is_told_and_heard_again(rig: Rig) -> None:
+    begin = rig.t
+    rig.inject("force", "silent", duration_s=1.0)
+    rig.run(0.9)
+    assert kinds(rig.errors) == {DeviceSilent}
+    assert rig.errors[0][0] - begin < 0.3
+    rig.run(0.3)
+    rig.errors.clear()
+    rig.forces.clear()
+    rig.run(1.0)
+    assert not rig.errors
+    assert len(rig.forces) == pytest.approx(100, abs=2)
+    assert rig.force.counters["lost_samples"] == pytest.approx(100, abs=2)
+
+
+def test_vanished_load_cell_is_lost_until_the_port_is_back(rig: Rig) -> None:
+    rig.inject("force", "vanish", duration_s=0.5)
+    rig.run(0.4)
+    assert kinds(rig.errors) == {DeviceLost}
+    assert len(rig.errors) < 100
+    rig.run(0.3)
+    rig.errors.clear()
+    rig.forces.clear()
+    rig.run(0.5)
+    assert rig.forces and not rig.errors
+
+
+@pytest.mark.parametrize(("kind", "value"), [("delay", 0.1), ("delay", 0.4), ("drop", None), ("duplicate", None)])
+def test_bad_wire_to_the_load_cell(rig: Rig, kind: str, value: float | None) -> None:
+    """The tare gets there; its answer is given to it alone, and the stream is not disturbed."""
+    rig.inject("force", kind, probability=0.2, value=value, direction="to_device")
+    for _ in range(10):
+        rig.force.set_zero()
+        rig.run(1.5)
+        if rig.errors:  # three times lost is told
+            assert kinds(rig.errors) == {DeviceSilent}
+            rig.errors.clear()
+    assert {round(s.reading, 6) for s in rig.forces} <= {TRUE_READING, 0.0, -0.0}
+    assert rig.forces[-1].reading == pytest.approx(0.0, abs=1e-6)
+    assert rig.force.counters["lost_samples"] == 0
+
+
+# The load cell itself -------------------------------------------------------------------------------------------------
+
+
+def test_load_cell_that_restarts_is_told_before_it_streams_again(rig: Rig) -> None:
+    begin = rig.t
+    rig.inject("force", "reset")
+    rig.run(0.9)
+    assert kinds(rig.errors) == {DeviceSilent}
+    assert rig.errors[0][0] - begin < 0.3
+    assert all(s.t < begin + 0.02 for s in rig.forces)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_saturated_load_cell_says_so_on_every_sample(rig: Rig, sign: float) -> None:
+    rig.inject("force", "saturate", value=sign, duration_s=1.0)
+    rig.run(1.0)
+    flagged = rig.forces[2:-2]
+    assert len(flagged) > 90
+    assert all(s.flags == SampleFlag.OVER_RANGE and s.reading * sign > 3.0 for s in flagged)
+    rig.forces.clear()
+    rig.run(0.3)
+    assert not any(s.flags for s in rig.forces[2:])
+
+
+def test_wrong_status_of_the_load_cell_is_passed_on(rig: Rig) -> None:
+    rig.inject("force", "wrong_status", value=2.0)
+    rig.run(0.5)
+    assert {s.flags for s in rig.forces[2:]} == {SampleFlag.SENSOR_ERROR}
+
+
+def test_frozen_load_cell_is_passed_on_as_it_is(rig: Rig) -> None:
+    """The driver cannot know; that a force does not change while the stage moves is for the engine to notice."""
+    rig.inject("force", "freeze")
+    rig.run(1.0)
+    assert len(rig.forces) == pytest.approx(100, abs=2)
+    assert not rig.errors
+
+
+# The supply's bus -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("direction", ["from_device", "to_device"])
+@pytest.mark.parametrize(("kind", "value"), [("delay", 0.05), ("delay", 0.4), ("drop", None), ("duplicate", None)])
+def test_bad_bus_costs_time_but_never_truth(live: Rig, kind: str, value: float | None, direction: str) -> None:
+    live.inject("hv", kind, probability=0.05, value=value, direction=direction)
+    live.run(3.0)
+    live.hv.set_voltage(500.0)
+    live.settle()
+    at = live.t
+    live.run(3.0)
+    assert not live.errors or kinds(live.errors) == {DeviceSilent}
+    assert {s.flags & ~HVFlag.RAMPING for s in live.outputs} == {HVFlag.ON}
+    assert all(s.voltage == pytest.approx(VOLTS, abs=3) for s in live.outputs if s.t < at - 0.6)
+    assert live.outputs[-1].setpoint == 500.0
+    assert live.outputs[-1].voltage == pytest.approx(500.0, abs=3)
+    if not (kind == "delay" and value == 0.05):
+        assert live.hv.counters["retries"] + live.hv.counters["unexpected_frames"] > 0
+
+
+@pytest.mark.parametrize("chance", [0.1, 0.5, 0.9])
+def test_emergency_off_gets_through_a_bus_that_loses_frames_or_is_said_not_to(live: Rig, chance: float) -> None:
+    live.inject("hv", "drop", probability=chance, direction="both")
+    live.hv.emergency_off()
+    live.run(5.0)
+    assert not live.hv.busy
+    unconfirmed = any("EMERGENCY OFF IS NOT CONFIRMED" in str(error) for _, error in live.errors)
+    assert unconfirmed or float(live.bench.world.voltage(np.array([live.t]))[0]) < 1.0
+
+
+def test_silent_module_is_told_within_a_second_and_asked_again(live: Rig) -> None:
+    begin = live.t
+    live.inject("hv", "silent", duration_s=2.0)
+    live.run(1.9)
+    assert kinds(live.errors) == {DeviceSilent}
+    assert live.errors[0][0] - begin < 0.9
+    live.run(1.0)
+    live.errors.clear()
+    live.outputs.clear()
+    live.run(1.0)
+    assert len(live.outputs) == pytest.approx(10, abs=1) and not live.errors
+
+
+def test_vanished_bus_is_lost_until_it_is_back(live: Rig) -> None:
+    live.inject("hv", "vanish", duration_s=0.5)
+    live.run(0.4)
+    assert kinds(live.errors) == {DeviceLost}
+    assert len(live.errors) < 10
+    live.run(1.5)
+    live.errors.clear()
+    live.outputs.clear()
+    live.run(1.0)
+    assert live.outputs and not live.errors
+
+
+# The module itself ----------------------------------------------------------------------------------------------------
+
+
+def test_module_that_restarts_is_registered_again_and_left_off(live: Rig) -> None:
+    live.inject("hv", "reset")
+    live.run(15.0)
+    assert live.hv.counters["log_ons"] >= 1
+    assert live.outputs[-1].flags == HVFlag(0)
+    assert live.outputs[-1].setpoint == 0.0
+    assert float(live.hv.settings["current_limit_A"]) == pytest.approx(1e-3)  # what was set is gone, and it shows
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "flag"),
+    [
+        ("interlock", None, HVFlag.INTERLOCK_OPEN),
+        ("inhibit", None, HVFlag.INHIBITED),
+        ("over_current", 2e-4, HVFlag.CURRENT_LIMIT),
+        ("breakdown", None, HVFlag.CURRENT_LIMIT),
+        ("wrong_status", float(1 << 13), HVFlag.TRIPPED),
+    ],
+)
+def test_what_the_module_reports_shows_in_the_next_samples(
+    live: Rig, kind: str, value: float | None, flag: HVFlag
+) -> None:
+    live.inject("hv", kind, value=value)
+    live.run(0.5)
+    assert flag in live.outputs[-1].flags
+    assert not live.errors
+
+
+def test_an_event_stays_latched_until_cleared(live: Rig) -> None:
+    live.inject("hv", "inhibit", duration_s=0.5)
+    live.run(1.5)
+    assert HVFlag.INHIBITED in live.outputs[-1].flags
+    live.hv.switch_on()
+    live.run(0.2)
+    assert "EXTERNAL_INHIBIT is latched" in str(live.errors[-1][1])
+    live.hv.clear()
+    live.settle()
+    live.run(0.3)
+    assert live.outputs[-1].flags == HVFlag(0)
+
+
+def test_sagging_output_is_measured(live: Rig) -> None:
+    live.inject("hv", "sag", value=0.5)
+    live.run(1.0)
+    assert live.outputs[-1].voltage == pytest.approx(0.5 * VOLTS, abs=5)
+    assert live.outputs[-1].setpoint == VOLTS
+
+
+def test_output_that_cannot_be_switched_off_goes_on_being_measured(live: Rig) -> None:
+    """Control and status say off; the voltage that is there says otherwise, and is what the guard looks at."""
+    live.inject("hv", "stuck_on")
+    live.hv.emergency_off()
+    live.settle()
+    live.run(0.5)
+    assert HVFlag.EMERGENCY_OFF in live.outputs[-1].flags
+    assert live.outputs[-1].voltage == pytest.approx(VOLTS, abs=5)
+
+
+def test_frozen_monitor_is_passed_on_as_it_is(live: Rig) -> None:
+    """The driver cannot know; that the voltage does not follow the set-point is for the engine to notice."""
+    live.inject("hv", "freeze")
+    live.hv.set_voltage(200.0)
+    live.run(2.0)
+    assert len({s.voltage for s in live.outputs[1:]}) == 1
+    assert live.outputs[-1].setpoint == 200.0
+    assert not live.errors
