@@ -10,8 +10,9 @@ from rig.log.errors import LogError
 
 
 class PartFile:
-    """Written as ``<path>.part`` (or with another ``ending``), unbuffered; `finish` syncs it and gives it its name. It never overwrites another.
+    """Written as ``<path>.part`` (or with another ``ending``), unbuffered; `finish` syncs it and gives it its name.
 
+    It never overwrites another.
     The first failed write closes the file for good: what had been written before stays, cut after the last whole
     `put`, and every later call raises. Raises `LogError`, from the constructor too.
     """

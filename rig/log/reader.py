@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections import defaultdict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -15,9 +16,11 @@ from numpy.typing import NDArray
 
 from rig.log import schema
 from rig.log.errors import LogError
-from rig.log.scan import MAX_TABLES, ChannelInfo, Damaged, Gap, Record, Scan, Source, chunk_content, messages
+from rig.log.scan import MAX_TABLES, ChannelInfo, Damaged, Gap, Record, Scan, Source, chunk_content, messages, spans
 
 Columns = dict[str, NDArray[Any]]
+
+_TIMES = struct.Struct("<QQ")  # log time and publish time, as they lie before the payload
 
 
 class Message(NamedTuple):
@@ -89,8 +92,9 @@ class Log:
 
     def messages(self, topic: str) -> Iterator[Message]:
         """The messages on one topic in the order of the file; none when the topic is not in the log."""
-        for _, log_ns, publish_ns, payload in self._payloads({topic}):
-            yield Message(log_ns, publish_ns, self._decode(topic, payload))
+        for _, row in self._rows({topic}):
+            log_ns, publish_ns = _TIMES.unpack_from(row)
+            yield Message(log_ns, publish_ns, self._decode(topic, row[_TIMES.size :]))
 
     def columns(self, topic: str) -> Columns:
         """The messages on one topic as arrays of shape (n,): ``log_ns``, ``publish_ns`` and every field by its name.
@@ -101,20 +105,10 @@ class Log:
 
     def tables(self, topics: Collection[str]) -> dict[str, Columns]:
         """`columns` of several topics, in one pass over the file."""
-        rows: dict[str, tuple[list[int], list[int], list[bytes]]] = {topic: ([], [], []) for topic in topics}
-        for topic, log_ns, publish_ns, payload in self._payloads(set(topics)):
-            log_times, publish_times, payloads = rows[topic]
-            log_times.append(log_ns)
-            publish_times.append(publish_ns)
-            payloads.append(payload)
-        return {
-            topic: {
-                "log_ns": np.array(log_times, dtype=np.int64),
-                "publish_ns": np.array(publish_times, dtype=np.int64),
-                **self._fields(topic, payloads),
-            }
-            for topic, (log_times, publish_times, payloads) in rows.items()
-        }
+        rows: dict[str, list[bytes]] = {topic: [] for topic in topics}
+        for topic, row in self._rows(set(topics)):
+            rows[topic].append(row)
+        return {topic: self._columns(topic, of_topic) for topic, of_topic in rows.items()}
 
     def raw_messages(self) -> Iterator[tuple[ChannelInfo, int, int, int, bytes] | None]:
         """All messages as written: channel, sequence number, log time, publish time, payload; None ends each chunk."""
@@ -125,7 +119,8 @@ class Log:
                     yield chunk.channels[channel], sequence, log_ns, publish_ns, content[start:end]
                 yield None
 
-    def _payloads(self, topics: set[str]) -> Iterator[tuple[str, int, int, bytes]]:
+    def _rows(self, topics: set[str]) -> Iterator[tuple[str, bytes]]:
+        """Topic, and log time, publish time and payload in one piece, of the messages on ``topics``."""
         unknown = topics - schema.CHANNELS.keys()
         if unknown:
             raise LogError(self.path, f"no log has a topic {', '.join(sorted(unknown))}")
@@ -134,9 +129,9 @@ class Log:
                 wanted = {number: info.topic for number, info in chunk.channels.items() if info.topic in topics}
                 if wanted:
                     content = self._content(source, chunk)
-                    for channel, _, log_ns, publish_ns, start, end in messages(content, dict(chunk.channels)):
+                    for channel, start, end in spans(content):
                         if channel in wanted:
-                            yield wanted[channel], log_ns, publish_ns, content[start:end]
+                            yield wanted[channel], content[start:end]
 
     def _content(self, source: Source, chunk: _Chunk) -> bytes:
         try:
@@ -150,18 +145,18 @@ class Log:
         except ValueError as error:
             raise LogError(self.path, str(error), "Another program wrote it, or wrote into it.") from error
 
-    def _fields(self, topic: str, payloads: list[bytes]) -> Columns:
-        n = len(payloads)
-        columns: Columns = {
-            field.name: np.empty(n, dtype=_NUMPY[field.type]) for field in schema.CHANNELS[topic].fields
-        }
-        fast = np.zeros(n, dtype=bool)
+    def _columns(self, topic: str, rows: list[bytes]) -> Columns:
+        fields = schema.CHANNELS[topic].fields
+        columns: Columns = {name: np.empty(len(rows), dtype=np.int64) for name in ("log_ns", "publish_ns")}
+        columns |= {field.name: np.empty(len(rows), dtype=_NUMPY[field.type]) for field in fields}
+        fast = np.zeros(len(rows), dtype=bool)
         packing = _packing(topic)
         if packing is not None:
-            fast = packing.unpack(payloads, columns)
-        for row in np.flatnonzero(~fast):
-            for name, value in self._decode(topic, payloads[row]).items():
-                columns[name][row] = value
+            fast = packing.unpack(rows, columns)
+        for n in np.flatnonzero(~fast):
+            columns["log_ns"][n], columns["publish_ns"][n] = _TIMES.unpack_from(rows[n])
+            for name, value in self._decode(topic, rows[n][_TIMES.size :]).items():
+                columns[name][n] = value
         return columns
 
 
@@ -293,19 +288,18 @@ _WIRE_TYPE = {"double": 1, "bool": 0, "fixed32": 5, "sfixed64": 1, "string": 2}
 
 
 class _Packing(NamedTuple):
-    """How a message lies in its bytes when its texts are empty."""
+    """How the times and a message lie in their bytes when the message's texts are empty."""
 
     layout: np.dtype[Any]  # the numbers
     fixed: dict[int, int]  # offset and value of the bytes that are always the same
     bools: list[str]
     texts: list[str]
 
-    def unpack(self, payloads: list[bytes], columns: Columns) -> NDArray[np.bool_]:
-        """Fill the rows of ``columns`` whose payload lies like this, all at once; which rows those are."""
+    def unpack(self, rows: list[bytes], columns: Columns) -> NDArray[np.bool_]:
+        """Fill the rows of ``columns`` whose bytes lie like this, all at once; which rows those are."""
         size = self.layout.itemsize
-        fits = np.fromiter((len(payload) == size for payload in payloads), dtype=bool, count=len(payloads))
-        data = np.frombuffer(b"".join([payload for payload in payloads if len(payload) == size]), dtype=np.uint8)
-        data = data.reshape(-1, size)
+        fits = np.fromiter((len(row) == size for row in rows), dtype=bool, count=len(rows))
+        data = np.frombuffer(b"".join([row for row in rows if len(row) == size]), dtype=np.uint8).reshape(-1, size)
         sound = np.ones(len(data), dtype=bool)
         for offset, value in self.fixed.items():
             sound &= data[:, offset] == value
@@ -326,9 +320,9 @@ def _packing(topic: str) -> _Packing | None:
     fields = schema.CHANNELS[topic].fields
     if any(field.type not in _WIRE_TYPE for field in fields):
         return None
-    kinds: dict[str, tuple[np.dtype[Any], int]] = {}
+    kinds: dict[str, tuple[np.dtype[Any], int]] = {"log_ns": (np.dtype("<i8"), 0), "publish_ns": (np.dtype("<i8"), 8)}
     fixed: dict[int, int] = {}
-    size = 0
+    size = _TIMES.size
     for number, field in enumerate(fields, 1):
         fixed[size] = number << 3 | _WIRE_TYPE[field.type]
         size += 1

@@ -37,6 +37,7 @@ EXPANSION = (32 * 1024 * 1024, 32)
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")  # first time, last time, size, crc, length of the compression's name
 _MESSAGE = struct.Struct("<BQHIQQ")
+_MESSAGE_START = struct.Struct("<BQH")
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
@@ -336,6 +337,17 @@ def messages(content: bytes, channels: dict[int, ChannelInfo]) -> Iterator[RawMe
                 described = -1
                 if len(channels) > MAX_CHANNELS:
                     raise Damaged(f"more than {MAX_CHANNELS} channels")
+        offset = end
+
+
+def spans(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Channel, start and end of the messages of a content that `messages` has accepted, from their log time on."""
+    offset, size, unpack = 0, len(content), _MESSAGE_START.unpack_from
+    while offset < size:
+        opcode, length, channel = unpack(content, offset)
+        end = offset + 9 + length
+        if opcode == 5:  # Opcode.MESSAGE
+            yield channel, offset + 15, end
         offset = end
 
 
