@@ -169,7 +169,7 @@ class Identification:
             "format": "dea-rig identification 1",
             "convention": CONVENTION,
             "terms": self.terms,
-            "quantities": {name: _quantity_dict(q) for name, q in self.quantities.items()},
+            "quantities": {name: quantity_dict(q) for name, q in self.quantities.items()},
             "stiffness_at": {"meridional_stretch": self.stretch[0], "hoop_stretch": self.stretch[1]},
             "stiffness_curve": {
                 "meridional_stretch": list(self.stiffness_curve.meridional_stretch),
@@ -232,7 +232,7 @@ class Identification:
         return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
 
 
-def _quantity_dict(quantity: Quantity) -> dict[str, Any]:
+def quantity_dict(quantity: Quantity) -> dict[str, Any]:
     return {
         "value": _finite(quantity.value),
         "standard_uncertainty": _finite(quantity.uncertainty),
