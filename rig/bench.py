@@ -185,7 +185,8 @@ class Bench:
 
     def close(self) -> None:
         """Close every device and link, whatever state they are in."""
-        for thing in [*self.devices.values(), *self._byte_links.values(), *self._frame_links.values()]:
+        things = (*self.devices.values(), *self._byte_links.values(), *self._frame_links.values())
+        for thing in things:
             thing.close()
 
 

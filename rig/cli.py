@@ -6,6 +6,8 @@ Heavy things are imported inside the commands that use them, so that ``dea-rig -
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +82,11 @@ def check(scene: Path, protocol: Path) -> None:
 @click.argument("scene", type=FILE)
 @click.argument("protocol", type=FILE)
 @click.option("-o", "--out", type=FILE, required=True, help="Log to write; never overwrites.")
-@click.option("--ports", type=FILE, help="Ports by role as `dea-rig sim` prints them; in place of the scene's.")
+@click.option(
+    "--ports",
+    type=click.Path(path_type=Path, dir_okay=False, allow_dash=True),
+    help="Ports by role as `dea-rig sim` prints them; in place of the scene's.",
+)
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports; asks once more unless --yes.")
 @click.option("--yes", is_flag=True, help="Answer that question with yes: for unattended simulated benches.")
 def run(scene: Path, protocol: Path, out: Path, ports: Path | None, arm: bool, yes: bool) -> None:
@@ -159,15 +165,131 @@ def view(log: Path, save: Path | None, screenshot: Path | None) -> None:
             click.echo(f"written: {path}")
 
 
+@main.command()
+@click.argument("cases", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
+def solve(cases: Path) -> None:
+    """Solve the films in CASES.json (- reads standard input) and print the answers as JSON.
+
+    CASES is a list of objects in SI units with id, a, b, thickness, prestretch, h, voltage, wrinkling ("plain" or
+    "tension_field"), material {mu, alpha, eps_r} and optionally tolerance.
+    """
+    from rig.errors import ConfigError
+    from rig.solve_cases import CaseError, solve_cases
+
+    try:
+        answers = solve_cases(_read_json(cases, "cases"))
+    except CaseError as error:
+        raise ConfigError(f"{cases}: {error}.") from None
+    click.echo(json.dumps(answers, indent=2))
+
+
+@main.group()
+def benchmark() -> None:
+    """Measure: error against run time, stability. Quick by default."""
+
+
+def _benchmark_options(command: Callable[..., None]) -> Callable[..., None]:
+    command = click.option("--full", is_flag=True, help="The whole grid; takes many minutes.")(command)
+    folder = click.Path(path_type=Path, file_okay=False)
+    return click.option("--out", type=folder, default="benchmarks", show_default=True, help="For JSON, CSV, PNG.")(
+        command
+    )
+
+
+@benchmark.command("solver")
+@_benchmark_options
+def benchmark_solver(full: bool, out: Path) -> None:
+    """Error of the membrane solver and of other methods against their run time."""
+    from rig.benchmark import solver
+
+    _benchmark(solver.run, solver.render, "solver", full, out)
+
+
+@benchmark.command("extremes")
+@_benchmark_options
+def benchmark_extremes(full: bool, out: Path) -> None:
+    """The solver in extreme states: statuses, and true error against the error it states."""
+    from rig.benchmark import extremes
+
+    _benchmark(extremes.run, extremes.render, "extremes", full, out)
+
+
+def _benchmark(run: Callable[..., Any], render: Callable[..., Any], name: str, full: bool, out: Path) -> None:
+    from rig.progress import progress
+    from rig.tables import show
+
+    with progress(f"benchmark {name}") as update:
+        report = run(full, out, lambda share, what: update(share, 1.0, what))
+    show(render(report))
+    click.echo(f"written to {out}/")
+
+
+@main.command()
+@click.option("--port", "ports", multiple=True, help="Ask on this serial port; default: all that the system lists.")
+@click.option("--bus", "buses", multiple=True, metavar="INTERFACE:CHANNEL", help="Ask on this CAN bus too.")
+def devices(ports: tuple[str, ...], buses: tuple[str, ...]) -> None:
+    """List who answers on which port and bus, and propose the lines for a scene. Sends only questions."""
+    from drivers.discovery import Bus, discover
+    from rig.clock import RealClock
+    from rig.tables import devices_table, show
+
+    asked = []
+    for text in buses:
+        interface, colon, channel = text.partition(":")
+        if not (interface and colon and channel):
+            raise click.BadParameter(f"{text!r} is not INTERFACE:CHANNEL, e.g. slcan:/dev/ttyACM0", param_hint="--bus")
+        asked.append(Bus(interface, channel))
+    found = discover(RealClock(), list(ports) or None, asked)
+    show(*devices_table(found))
+
+
+@main.command()
+@click.argument("log", type=FILE)
+def info(log: Path) -> None:
+    """What is in LOG: run, devices, channels and rates, gaps, outcome."""
+    from rig.log.info import info as describe
+
+    click.echo(describe(log))
+
+
+@main.command()
+@click.argument("log", type=FILE)
+@click.option("-o", "--out", type=FILE, required=True, help="Log to write.")
+def recover(log: Path, out: Path) -> None:
+    """Save what can be read of a damaged LOG. Exit code 0: all of it; 3: part of it; 1: nothing."""
+    from rig.log.recover import recover as rescue
+
+    recovery = rescue(log, out)
+    click.echo(recovery.report)
+    click.get_current_context().exit(recovery.exit_code)
+
+
+@main.command()
+@click.argument("log", type=FILE)
+@click.option("-o", "--out", type=FILE, required=True, help="File to write: .csv or .parquet.")
+@click.option("--topic", help="One channel as recorded; default: the aligned run.")
+def export(log: Path, out: Path, topic: str | None) -> None:
+    """Write LOG as a table, with units in the header."""
+    from rig.log.export import export as write
+
+    click.echo(f"{out}: {write(log, out, topic)} rows")
+
+
 def _read_ports(path: Path) -> dict[str, dict[str, Any]]:
     from rig.errors import ConfigError
-    from rig.toml_file import read_text
 
-    text = click.get_text_stream("stdin").read() if str(path) == "-" else read_text(path, "ports")
-    try:
-        ports = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not the JSON that `dea-rig sim` prints: {error}.") from None
+    ports = _read_json(path, "ports")
     if not isinstance(ports, dict) or not all(isinstance(value, dict) for value in ports.values()):
         raise ConfigError(f"{path}: not the JSON that `dea-rig sim` prints: a table of ports by role is needed.")
     return ports
+
+
+def _read_json(path: Path, kind: str) -> Any:
+    from rig.errors import ConfigError
+    from rig.toml_file import read_text
+
+    text = sys.stdin.read() if str(path) == "-" else read_text(path, kind)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not a JSON file of {kind}: {error}.") from None

@@ -166,7 +166,8 @@ class Engine:
 
     def run(self) -> tuple[Outcome, RigError | DeviceError | None]:
         """Carry out the plan and leave the rig safe. The error, if any, is what ended the run."""
-        status, reason, error = "complete", "the protocol ended", None
+        status, reason = "complete", "the protocol ended"
+        error: RigError | DeviceError | None = None
         try:
             self.bench.attach(self.recorder.wire)
             if self.bench.hv is not None:

@@ -105,7 +105,7 @@ def _how_it_ended(outcome: Outcome) -> str:
 
 
 def _certificates(scene: Scene, folder: Path) -> dict[str, Certificate]:
-    found = {}
+    found: dict[str, Certificate] = {}
     for role, table in scene.instruments.items():
         if table.certificate is None:
             continue

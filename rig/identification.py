@@ -110,7 +110,7 @@ def _errors(run: Run, scene: Scene) -> CurveErrors:
 
 
 def _certificates(run: Run) -> dict[str, Certificate]:
-    found = {}
+    found: dict[str, Certificate] = {}
     for name, attachment in run.log.attachments.items():
         if name.startswith("certificate."):
             certificate = parse_certificate(attachment.data, f"{run.log.path} ({name} inside)")

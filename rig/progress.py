@@ -8,10 +8,12 @@ from contextlib import contextmanager
 
 import click
 
+from rig.clock import RealClock
+
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[float, float, str], None]]:
-    """Yield ``update(done, total, label)``; the units of done and total are seconds of the bench's own time."""
+    """Yield ``update(done, total, label)``. Time left is by the host's clock, from what has been done so far."""
     if sys.stderr.isatty():
         yield from _bar(title)
     else:
@@ -37,12 +39,14 @@ def _bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
 
 def _lines(title: str) -> Iterator[Callable[[float, float, str], None]]:
     click.echo(title, err=True)
+    clock = RealClock()
     last = ""
 
     def update(done: float, total: float, label: str) -> None:
         nonlocal last
         if label != last:
             last = label
-            click.echo(f"  {100 * done / total:3.0f} %  {total - done:4.0f} s left  {label}", err=True)
+            left = f"{clock.now() * (total - done) / done:4.0f} s left" if done > 0 else ""
+            click.echo(f"  {100 * done / total:3.0f} %  {left:11}  {label}", err=True)
 
     yield update

@@ -6,11 +6,15 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console, Group
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import RenderableType
 
     from calibration.result import Identification
+    from drivers.discovery import Found as FoundDevice
     from rig.experiment import Experiment
     from rig.identification import Found
 
@@ -111,6 +115,20 @@ def truth_table(found: Found) -> RenderableType:
                 f"{(quantity.value - known[name]) / quantity.uncertainty:+.2f}",
             )
     return table
+
+
+def devices_table(found: Sequence[FoundDevice]) -> list[RenderableType]:
+    """Who answers where, and below it the lines that name them in a scene."""
+    if not found:
+        return ["No serial port was found, and no CAN bus was asked. Name one with --port or --bus."]
+    table = Table(title="Ports and buses")
+    for heading in ("where", "role", "driver", "model", "serial number", "firmware", "remark"):
+        table.add_column(heading, overflow="fold")
+    for one in found:
+        who = one.identity
+        table.add_row(one.where, one.role, one.driver, who.model, who.serial, who.firmware, one.remark)
+    lines: list[RenderableType] = [Text(one.scene) for one in found if one.scene]
+    return [table, *(["For the scene:", *lines] if lines else [])]
 
 
 def _with_unit(value: float, unit: str, digits: int) -> str:
