@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import math
 import zlib
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Protocol
 
 import numpy as np
@@ -187,7 +187,7 @@ class SimulatedBench:
         elif fault.kind in LINK_FAULTS:
             self._switch_upset(fault, number // 2, begins)
         else:
-            self._switch_device(fault, begins, t)
+            self._switch_device(fault, number // 2, begins, t)
 
     def _switch_upset(self, fault: Fault, number: int, begins: bool) -> None:
         directions = ["from_device", "to_device"] if fault.direction == "both" else [fault.direction]
@@ -213,8 +213,14 @@ class SimulatedBench:
                 else:
                     wire.upset_to_device = bytes_hook
 
-    def _switch_device(self, fault: Fault, begins: bool, t: float) -> None:
+    def _switch_device(self, fault: Fault, number: int, begins: bool, t: float) -> None:
         instrument = self.instruments[fault.role]
+        if isinstance(instrument, ZaberStage | KeyenceLKG) and fault.kind in ("alert", "interleave"):
+            if fault.kind == "alert":
+                self._alert(instrument, fault, begins, t)
+            else:
+                instrument.before_reply = self._interleave(instrument, fault, number) if begins else None
+            return
         if fault.kind == "reset":
             if begins:
                 instrument.reset(t)
@@ -224,10 +230,7 @@ class SimulatedBench:
             return
         match instrument:
             case ZaberStage():
-                if fault.kind == "alert":
-                    self._alert(instrument, fault, begins, t)
-                else:
-                    instrument.wrong_status = "FS" if begins else None
+                instrument.wrong_status = "FS" if begins else None
             case GSV8():
                 if fault.kind == "saturate":
                     instrument.saturated = (-1 if fault.value is not None and fault.value < 0 else 1) if begins else 0
@@ -235,8 +238,6 @@ class SimulatedBench:
                     instrument.set_status((3 if fault.value is None else int(fault.value) & 3) if begins else 0)
             case KeyenceLKG():
                 match fault.kind:
-                    case "alert":
-                        self._alert(instrument, fault, begins, t)
                     case "saturate":
                         sign = -1 if fault.value is not None and fault.value < 0 else 1
                         instrument.saturated = sign if begins else 0
@@ -257,6 +258,15 @@ class SimulatedBench:
             rest = fault.duration_s - period
             if rest > 0:
                 self.inject(fault.model_copy(update={"at_s": t + period, "duration_s": rest}))
+
+    def _interleave(self, instrument: ZaberStage | KeyenceLKG, fault: Fault, number: int) -> Callable[[float], None]:
+        rng = self._rng(f"fault {number}")
+
+        def alert_by_chance(t: float) -> None:
+            if rng.random() < fault.probability:
+                instrument.alert(t)
+
+        return alert_by_chance
 
     def _switch_supply(self, supply: IsegEDCP, fault: Fault, begins: bool, t: float) -> None:
         match fault.kind:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 
 import numpy as np
 
@@ -48,6 +49,8 @@ class KeyenceLKG:
     ----------
     saturated, no_value, wrong_status : faults
         Sign of the end of range it shows (0: none); it has no value; every measurement is answered with an error.
+    before_reply : callable or None
+        A fault: called with the time before each reply is sent.
     """
 
     def __init__(self, settings: DisplacementTruth, world: World, wire: ByteWire, rng: np.random.Generator) -> None:
@@ -59,6 +62,7 @@ class KeyenceLKG:
         self.saturated = 0
         self.no_value = False
         self.wrong_status = False
+        self.before_reply: Callable[[float], None] | None = None
         self._frozen: float | None = None
         self._asleep_until = -math.inf
         # Kept in the controller
@@ -165,6 +169,8 @@ class KeyenceLKG:
         except _Refused as refused:
             name = re.sub("[^0-9A-Z]", "?", head)[:8]
             answer = f"ER,{name},{refused.number:02d}"
+        if self.before_reply is not None:
+            self.before_reply(t)
         self._wire.send(answer.encode("ascii") + b"\r", t + self._settings.answer_ms * 1e-3)
 
     def _answer(self, head: str, p: list[str], t: float) -> str:

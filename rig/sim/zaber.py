@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from typing import Literal
 
 from rig.sim.path import trapezoid
@@ -43,8 +44,8 @@ class ZaberStage:
     ----------
     wrong_status : str or None
         A fault: this flag is shown as the highest warning, whatever is true.
-    frozen : bool
-        A fault: the position that is reported does not change.
+    before_reply : callable or None
+        A fault: called with the time before each reply is sent.
     """
 
     def __init__(self, settings: StageTruth, world: World, wire: ByteWire) -> None:
@@ -57,6 +58,7 @@ class ZaberStage:
         self._asleep_until = -math.inf
         self._frozen_at: int | None = None
         self.wrong_status: str | None = None
+        self.before_reply: Callable[[float], None] | None = None
         s = settings
         step = s.microstep_um * 1e-3  # mm
         self._limits = {
@@ -188,6 +190,8 @@ class ZaberStage:
         if identifier == "--":  # no reply wanted
             return
         text = f"{verdict} {self._status(t)} {data}"
+        if self.before_reply is not None:
+            self.before_reply(t)
         self._send("@", text, t + ANSWER_S, axis=axis, word=identifier, with_check=with_check)
 
     def _send(self, kind: str, text: str, t: float, *, axis: int, word: str, with_check: bool) -> None:

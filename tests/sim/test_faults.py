@@ -133,6 +133,16 @@ def test_alerts_come_in_between(stage):
     assert stage.ask("stage", b"", 0.7) == b"!01 1 IDLE WR\r\n" * 5
 
 
+def test_alerts_between_a_command_and_its_reply(make_host):
+    host = make_host("stage", "displacement")
+    host.bench.inject(fault("stage", "interleave", duration_s=1.0))
+    host.bench.inject(fault("displacement", "interleave", probability=0.5))
+    assert host.ask("stage", POLL) == b"!01 1 IDLE WR\r\n" + REPLY
+    pushed = [host.ask("displacement", b"M1\r").startswith(b"TG,1,") for _ in range(100)]
+    assert 30 < sum(pushed) < 70
+    assert host.ask("stage", POLL) == REPLY
+
+
 def test_reset_in_the_middle_of_a_move(make_host):
     host = make_host("stage", stage={"referenced_at_start": True})
     host.ask("stage", b"/1 1 move abs 100000\n")
