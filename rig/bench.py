@@ -185,9 +185,10 @@ class Bench:
 
     def close(self) -> None:
         """Close every device and link, whatever state they are in."""
-        things = (*self.devices.values(), *self._byte_links.values(), *self._frame_links.values())
-        for thing in things:
-            thing.close()
+        for device in self.devices.values():
+            device.close()
+        for link in (*self._byte_links.values(), *self._frame_links.values()):
+            link.close()
 
 
 def simulated_bench(scene: Scene) -> SimulatedBench:
