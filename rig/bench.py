@@ -187,7 +187,8 @@ class Bench:
         """Close every device and link, whatever state they are in."""
         for device in self.devices.values():
             device.close()
-        for link in (*self._byte_links.values(), *self._frame_links.values()):
+        links: list[ByteLink | FrameLink] = [*self._byte_links.values(), *self._frame_links.values()]
+        for link in links:
             link.close()
 
 
