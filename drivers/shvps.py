@@ -41,7 +41,7 @@ LONGEST_STEP_S = 0.25
 
 _MAX_LINE = 64
 _NUMBER = re.compile(r"-?[0-9]{1,6}")
-_VERSION = re.compile(r"([a-z]{3,12}) ([0-9]{1,4})")
+_VERSION = re.compile(r"(slave|master) ([0-9]{1,4})")
 _UNSAFE = "Take the high voltage away by hand: pull the power jack, then ground the electrodes."
 
 _Part = Generator[Ask[str], Answer[str], T]
@@ -226,7 +226,7 @@ class Shvps:
         if request == "QVer":
             return lambda line: _VERSION.fullmatch(line) is not None
         if request == "QName":
-            return lambda line: _VERSION.fullmatch(line) is None
+            return lambda line: not (_VERSION.fullmatch(line) or _NUMBER.fullmatch(line))
         limit = PLAUSIBLE * self._max_volts if request == "QVnow" else math.inf
         return lambda line: self._is_number(line, limit)
 
@@ -358,7 +358,8 @@ class Shvps:
         try:
             for request in ("SSwMode 0", "SVset 0"):  # both are on their way before anything is waited for
                 self._link.write(encode(request))
-            yield Ask("QVer")
+            # What was asked before may still be answered, by a version too; only the name comes after all that.
+            yield Ask("QName")
             yield from self._set("SwMode", OFF)
             yield from self._set("Vset", 0)
         except DeviceError as error:
