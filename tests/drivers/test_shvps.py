@@ -296,7 +296,7 @@ def test_late_answers_never_shift_answers_against_questions(live: Bench, late_s:
     assert {(s.voltage, s.setpoint, s.flags) for s in live.samples} == {(997.0, 1000.0, HVFlag.ON)}
 
 
-@pytest.mark.parametrize("late_s", [0.11, 0.15, 0.21, 0.25])
+@pytest.mark.parametrize("late_s", [0.15, 0.18, 0.21, 0.25])
 def test_late_voltage_is_never_taken_for_a_new_one(live: Bench, late_s: float) -> None:
     begin, original = live.t, live.fake.answer
     # the voltage is the time at which it was asked for, in milliseconds
