@@ -194,7 +194,7 @@ class KeyenceLKG:
     """A `drivers.roles.DisplacementSensor` on one OUT of an LK-G controller.
 
     Set-up enters communication mode to read sampling period and averaging back into ``settings``, and leaves it again.
-    Nothing is written. Averaging delays and low-passes the value by about ``averaging_window_s``.
+    Nothing is written. A value is the mean over the last ``averaging_window_s``; its time is the middle of that.
 
     Parameters
     ----------
@@ -373,6 +373,9 @@ class KeyenceLKG:
 
     def _measure(self) -> Script[str, Message]:
         t, value = yield from self._value()
+        window = self.averaging_window_s
+        if window < math.inf:  # NaN when it could not be read: then the value stands for the time of asking
+            t -= window / 2
         self._samples.append(DisplacementSample(t, value.number * self._unit, value.flag))
 
     def _value(self, delay_s: float = 0.0) -> _Part[tuple[float, Value]]:

@@ -167,7 +167,7 @@ class FakeLKG:
     def __init__(self) -> None:
         self.out1, self.out2 = "+01.2345", "XXXXXXXX"
         self.communicating = False
-        self.answers = {"SR,CA": "SR,CA,3", "SR,OC,1": "SR,OC,1,0,4", "SR,OC,2": "SR,OC,2,0,6", "PR": "PR,0"}
+        self.answers = {"SR,CA": "SR,CA,0", "SR,OC,1": "SR,OC,1,0,0", "SR,OC,2": "SR,OC,2,0,0", "PR": "PR,0"}
         self.log: list[str] = []
         self.out = b""
         self.after: Callable[[bytes], bytes] = lambda data: data
@@ -247,6 +247,7 @@ def test_encode() -> None:
 
 
 def test_set_up_transcript(bench: Bench) -> None:
+    bench.fake.answers |= {"SR,CA": "SR,CA,3", "SR,OC,1": "SR,OC,1,0,4"}
     bench.run(0.05)
     assert bench.fake.log[:8] == ["Q0", "SR,CA", "SR,OC,1", "R0", "PR", "M0", "M1", "M0"]
     assert bench.sensor.settings == {
@@ -305,6 +306,17 @@ def test_values_come_at_the_rate_in_metres_with_midpoint_times(measuring: Bench)
     assert values(measuring) == pytest.approx([1.2345e-3], rel=1e-12)
     gaps = [b.t - a.t for a, b in zip(measuring.samples, measuring.samples[1:], strict=False)]
     assert gaps == pytest.approx([0.01] * len(gaps), abs=2e-3)
+
+
+def test_time_of_a_value_is_the_middle_of_the_averaging_window(fake: FakeLKG) -> None:
+    """Asked and answered within a millisecond; 200 us times 256 samples are averaged before."""
+    asked: dict[str, list[float]] = {"plain": [], "averaged": []}
+    for kind, codes in (("plain", ("0", "0")), ("averaged", ("3", "4"))):
+        fake.answers |= {"SR,CA": f"SR,CA,{codes[0]}", "SR,OC,1": f"SR,OC,1,0,{codes[1]}"}
+        bench = Bench(KeyenceLKG("laser", fake), fake)
+        bench.run(0.1)
+        asked[kind] = [sample.t for sample in bench.samples]
+    assert asked["averaged"] == pytest.approx([t - 25.6e-3 for t in asked["plain"]], abs=1e-4)
 
 
 def test_other_output_and_unit(fake: FakeLKG) -> None:
@@ -386,7 +398,8 @@ def test_late_value_is_never_taken_for_a_new_one(measuring: Bench, late_s: float
     assert len(measuring.samples) > 20
     for sample in measuring.samples:
         if sample.t > begin:
-            assert sample.displacement * 10 == pytest.approx(sample.t - begin, abs=5e-3)
+            middle = measuring.sensor.averaging_window_s / 2
+            assert sample.displacement * 10 == pytest.approx(sample.t - begin + middle, abs=5e-3)
 
 
 def test_value_beyond_the_head_is_not_believed(measuring: Bench) -> None:
