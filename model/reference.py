@@ -385,18 +385,24 @@ def _stresses(states: _States, e1: Array, e2: Array) -> tuple[Array, Array]:
 
 
 def _natural_hoop(states: _States, e1: Array, start: Array) -> Array:
-    """Hoop strain without hoop stress, by Newton's method."""
-    natural = start.copy()
+    """First hoop strain above ``start`` without hoop stress, where the stress at ``start`` is negative; NaN if none."""
+    low, high = start.copy(), start + 0.02
     for _ in range(60):
+        short = _stresses(states, e1, high)[1] < 0
+        if not short.any():
+            break
+        low, high = np.where(short, high, low), np.where(short, high + 0.1, high)
+    natural = high.copy()
+    for _ in range(80):  # Newton's method, kept inside the bracket
         _, s2 = _stresses(states, e1, natural)
-        through = np.exp(-states.alpha * (e1 + natural))
-        rate = np.sum(states.mu * states.alpha * (np.exp(states.alpha * natural) + through), axis=0)
-        rate -= 2 * states.electric * np.exp(2 * (e1 + natural))
-        change = -s2 / rate
-        natural = natural + np.clip(change, -0.2, 0.2)
+        low, high = np.where(s2 < 0, natural, low), np.where(s2 < 0, high, natural)
+        change = -s2 / _stiffness(states, e1, natural)[2]
+        inside = (natural + change > low) & (natural + change < high)
+        change = np.where(inside, change, 0.5 * (low + high) - natural)
+        natural = natural + change
         if np.all((np.abs(change) <= 1e-16 * np.maximum(np.abs(natural), np.abs(e1))) | ~np.isfinite(change)):
             break
-    return natural
+    return np.where(short, np.nan, natural)
 
 
 def _evaluate(series: Array, length: Array) -> Array:

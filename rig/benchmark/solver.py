@@ -142,7 +142,7 @@ class Report:
 
 def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None) -> Report:
     """Measure, and write ``solver.json``, ``solver.csv``, ``solver.png`` and ``solver_speed.png`` into ``out_dir``."""
-    report = measure(cases=150 if full else 24, full=full, progress=progress)
+    report = measure(cases=150 if full else 24, full=full, rounds=3 if full else 2, progress=progress)
     save(report, out_dir)
     return report
 
