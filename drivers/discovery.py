@@ -195,8 +195,8 @@ def _gsv8(line: _Line) -> list[Found]:
     if not serial:
         return []
     for message in line.ask(gsv8.encode(gsv8.GET_FIRMWARE_VERSION), decoder.feed):
-        if isinstance(message, gsv8.Reply) and message.error <= 1:
-            version = message.data.hex(" ")
+        if isinstance(message, gsv8.Reply) and message.error <= 1 and len(message.data) == 4:
+            version = ".".join(str(int.from_bytes(message.data[at : at + 2], "big")) for at in (0, 2))
             break
     keys: Keys = {"serial": serial, "certificate": "the force sensor's certificate.toml"}
     return [_serial_found(line, "force", "gsv8", Identity("GSV-8", serial, version), keys)]

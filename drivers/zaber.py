@@ -289,7 +289,8 @@ class ZaberStage:
     """A `drivers.roles.Stage` on one axis of a Zaber device.
 
     Set-up reads identity, resolution, travel and speed from the device, clears old warnings (kept in
-    ``settings["warnings_at_start"]``), and locks the manual knob until `close`. After that the position is polled.
+    ``settings["warnings_at_start"]``), locks the manual knob until `close`, and asks a device that answers without
+    checksums to send them from now on. After that the position is polled.
 
     The stage refuses to move while it has no reference (warning flags WR, WH). When a reference it had is gone, most
     likely because the device restarted, `poll` raises `DeviceRefused`; so it does, once, for each fault flag that
@@ -309,8 +310,6 @@ class ZaberStage:
         How long to wait for each reply.
     full_step_um : float
         Travel per full motor step: 31.75 um is a 6.35 mm screw on a motor of 200 steps, as in the X-LSQ150B.
-    serial : str
-        If given, a device with another serial number is refused, untouched.
     """
 
     def __init__(
@@ -323,7 +322,6 @@ class ZaberStage:
         poll_rate_Hz: float = 50.0,
         timeout_s: float = 0.25,
         full_step_um: float = 31.75,
-        serial: str = "",
     ) -> None:
         self.name = name
         self.identity = Identity()
@@ -334,7 +332,6 @@ class ZaberStage:
         self._device, self._axis = device, axis
         self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
         self._full_step = full_step_um * 1e-6
-        self._expected_serial = serial
         self._codec = Codec(self.counters)
         self._dialogue: Dialogue[_Command, Reply] = Dialogue(
             self._label, self._send, self.counters, timeout_s=timeout_s
@@ -493,12 +490,6 @@ class ZaberStage:
         serial = yield from self._number("get system.serial", axis=0)
         version = (yield from self._ask("get version", axis=0)).message.data
         self.identity = Identity(model=f"Zaber device {device_id}", serial=str(serial), firmware=version)
-        if self._expected_serial and self._expected_serial != str(serial):
-            raise DeviceRefused(
-                self._label,
-                f"the stage on this port has serial number {serial}, the scene names {self._expected_serial}",
-                "Correct the port or the serial number in the scene.",
-            )
         resolution = yield from self._number("get resolution")
         low = yield from self._number("get limit.min")
         high = yield from self._number("get limit.max")

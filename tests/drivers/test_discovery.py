@@ -145,7 +145,7 @@ def test_laser(answer: bytes, remark: bool) -> None:
 def test_amplifier_also_while_it_streams(noise: bytes) -> None:
     found, _ = look(amplifier, baud=230_400, noise=noise)
     assert [(f.role, f.driver) for f in found] == [("force", "gsv8")]
-    assert found[0].identity == Identity("GSV-8", "14209636", "00 01 00 02")
+    assert found[0].identity == Identity("GSV-8", "14209636", "1.2")
     assert tomllib.loads(found[0].scene)["force"]["serial"] == "14209636"
 
 
