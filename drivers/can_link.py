@@ -44,7 +44,7 @@ class CanLink:
     Parameters
     ----------
     name : str
-        For error messages.
+        Name of the device that is on it, for error messages; the link's own ``name`` is interface and channel.
     interface : str
         One of `INTERFACES`: which python-can backend.
     channel : str
@@ -68,9 +68,9 @@ class CanLink:
         accept: Collection[int] | None = None,
         **options: Any,
     ) -> None:
-        self.name = name
+        self.name = f"{interface} {channel}"
         self.counters = dict.fromkeys(("frames_read", "frames_written", "foreign_frames", "error_frames", "garbage"), 0)
-        self._where = f"{name} ({interface} {channel})"
+        self._where = f"{name} ({self.name})"
         self._accept = None if accept is None else frozenset(accept)
         self._lock: PortLock | None = None
         self._bus: can.BusABC | None = self._open(interface, channel, bitrate, options)

@@ -21,7 +21,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.dialogue import Answer, Ask, Dialogue
+from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, label
 from drivers.link import CanFrame, DeviceRefused, DeviceSilent, FrameLink
 from drivers.roles import ForceSample, Identity, SampleFlag
 from drivers.sample_clock import SampleClock
@@ -305,21 +305,23 @@ class CiA404:
         unit: Literal["N", "mV/V"] | None = None,
         factor: float = 1.0,
     ) -> None:
+        where = label(name, link)
         if not 1 <= node <= 127:
-            raise DeviceRefused(name, f"node {node} does not exist", "Allowed: 1 to 127.")
+            raise DeviceRefused(where, f"node {node} does not exist", "Allowed: 1 to 127.")
         if not 1 <= channel <= 199:
-            raise DeviceRefused(name, f"channel {channel} does not exist", "CiA 404 counts them from 1 to 199.")
+            raise DeviceRefused(where, f"channel {channel} does not exist", "CiA 404 counts them from 1 to 199.")
         if not 0.02 <= rate_Hz <= 1000:
-            raise DeviceRefused(name, f"rate {rate_Hz} Hz is not possible", "Allowed: 0.02 to 1000 Hz.")
+            raise DeviceRefused(where, f"rate {rate_Hz} Hz is not possible", "Allowed: 0.02 to 1000 Hz.")
         self._period_ms = round(1000 / rate_Hz)
         self._rate = 1000 / self._period_ms
         if not abs(self._rate / rate_Hz - 1) <= _RATE_TOLERANCE:
             raise DeviceRefused(
-                name,
+                where,
                 f"rate {rate_Hz:g} Hz is not a whole number of milliseconds",
                 f"Next to it: {self._rate:.6g} Hz.",
             )
         self.name = name
+        self._label = where
         self.identity = Identity(model="CiA 404")
         self.reading_unit: str = unit or "N"
         self.settings: dict[str, str] = {}
@@ -335,7 +337,7 @@ class CiA404:
         self._factor = factor
         self._decoder = Decoder(node, self.counters)
         self._dialogue: Dialogue[_Request, Message] = Dialogue(
-            name,
+            where,
             self._transmit,
             self.counters,
             timeout_s=timeout_s,
@@ -374,7 +376,7 @@ class CiA404:
         self._link.close()
 
     def poll(self, now: float) -> Sequence[ForceSample]:
-        self._next_poll = now + self._interval  # a port that is gone is not asked in a busy loop
+        self._next_poll = now + LOST_AGAIN_S
         frames = self._link.read()
         if self._clock is None and self._dialogue.idle:
             frames = []
@@ -428,7 +430,7 @@ class CiA404:
             return
         self._clock = None  # set up again if somebody goes on polling
         raise DeviceRefused(
-            self.name,
+            self._label,
             "has restarted by itself (boot-up message) and stopped measuring",
             "Check its supply. Its tare and settings may be gone.",
         )
@@ -444,13 +446,13 @@ class CiA404:
         elif now - self._heard > max(self._timeout, 5.0 / self._rate):
             silent_s, self._heard = now - self._heard, now
             raise DeviceSilent(
-                self.name,
+                self._label,
                 f"no valid process value for {silent_s:.2f} s though the node was started",
                 "Check the device and its cable; it may have been switched off or stopped.",
             )
         if (rate := clock.other_rate()) is not None:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"sends at {rate:.4g} Hz although {self._rate:.4g} Hz were set",
                 "Its event timer may be coarser, or the bus loses frames.",
             )
@@ -479,14 +481,16 @@ class CiA404:
         return answer if isinstance(answer, Aborted) else None
 
     def _refused(self, what: str, why: Aborted, advice: str) -> DeviceRefused:
-        return DeviceRefused(self.name, f"{what}: {why.meaning}", advice)
+        return DeviceRefused(self._label, f"{what}: {why.meaning}", advice)
 
     def _set_up(self) -> Generator[_Step, _Got, None]:
         kind = yield from self._read(0x1000, 0, 4)
         if isinstance(kind, Aborted) or kind & 0xFFFF != PROFILE:
             stated = kind.meaning if isinstance(kind, Aborted) else f"profile {kind & 0xFFFF}"
             raise DeviceRefused(
-                self.name, f"node {self._node} is no CiA 404 device ({stated})", "Correct the node number in the scene."
+                self._label,
+                f"node {self._node} is no CiA 404 device ({stated})",
+                "Correct the node number in the scene.",
             )
         identity = []
         for sub in range(1, 5):
@@ -513,7 +517,7 @@ class CiA404:
         if known is None:
             stated = code.meaning if isinstance(code, Aborted) else f"code {code:08X}"
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"the unit of its values is neither newtons nor mV/V ({stated})",
                 "Set it to newtons in the device, or state unit and factor in the scene.",
             )
@@ -522,7 +526,9 @@ class CiA404:
             decimals = yield from self._read(DECIMALS, self._channel, 1)
             if isinstance(decimals, Aborted) or decimals > 9:
                 raise DeviceRefused(
-                    self.name, "does not state the decimal digits of its integer value", "Map the float value (6130h)."
+                    self._label,
+                    "does not state the decimal digits of its integer value",
+                    "Map the float value (6130h).",
                 )
             self.settings["decimals"] = str(decimals)
             self._factor /= 10.0**decimals
@@ -576,7 +582,7 @@ class CiA404:
         if timer != self._period_ms:
             stated = timer.meaning if isinstance(timer, Aborted) else f"{timer} ms"
             raise DeviceRefused(
-                self.name, f"event timer reads back as {stated} after {self._period_ms} ms", "Choose another rate."
+                self._label, f"event timer reads back as {stated} after {self._period_ms} ms", "Choose another rate."
             )
         self.settings["event_timer_ms"] = str(timer)
 

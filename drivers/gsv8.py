@@ -29,8 +29,8 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from drivers.dialogue import LOST_AGAIN_S, Ask, Dialogue, label
 from drivers.dialogue import Answer as Answered
-from drivers.dialogue import Ask, Dialogue
 from drivers.link import ByteLink, DeviceRefused, DeviceSilent
 from drivers.roles import ForceSample, Identity, SampleFlag
 from drivers.sample_clock import SampleClock
@@ -307,13 +307,15 @@ class GSV8:
         input_range_mV_per_V: float | None = None,
         int_full_scale: float = 1.05,
     ) -> None:
+        where = label(name, link)
         if not 1 <= channel <= 16:
-            raise DeviceRefused(name, f"channel {channel} does not exist", "A GSV-8 counts 1 to 8, a GSV-6 1 to 6.")
+            raise DeviceRefused(where, f"channel {channel} does not exist", "A GSV-8 counts 1 to 8, a GSV-6 1 to 6.")
         if not 0 < rate_Hz <= 48000:
-            raise DeviceRefused(name, f"data rate {rate_Hz} Hz is not possible", "Allowed: above 0, at most 48000 Hz.")
+            raise DeviceRefused(where, f"data rate {rate_Hz} Hz is not possible", "Allowed: above 0, at most 48000 Hz.")
         if input_range_mV_per_V is not None and not 0 < input_range_mV_per_V <= 1000:
-            raise DeviceRefused(name, f"input range {input_range_mV_per_V} mV/V is not possible", "Typical: 2 or 3.5.")
+            raise DeviceRefused(where, f"input range {input_range_mV_per_V} mV/V is not possible", "Typical: 2 or 3.5.")
         self.name = name
+        self._label = where
         self.identity = Identity(model="GSV-8")
         self.settings: dict[str, str] = {}
         self.counters: dict[str, int] = {"unexpected_answers": 0, "ignored_frames": 0, "bad_values": 0, "overloads": 0}
@@ -328,7 +330,7 @@ class GSV8:
         self._int_full_scale = int_full_scale
         self._decoder = Decoder(self.counters)
         self._dialogue: Dialogue[_Request, Message] = Dialogue(
-            name,
+            where,
             self._transmit,
             self.counters,
             timeout_s=timeout_s,
@@ -370,7 +372,7 @@ class GSV8:
         self._link.close()
 
     def poll(self, now: float) -> Sequence[ForceSample]:
-        self._next_poll = now + self._interval  # a port that is gone is not asked in a busy loop
+        self._next_poll = now + LOST_AGAIN_S
         data = self._link.read()
         if self._polls == 0:
             data = b""  # whatever was in the line belongs to an earlier conversation
@@ -420,13 +422,13 @@ class GSV8:
         elif now - self._heard > max(self._timeout, 5.0 / self._rate):
             silent_s, self._heard = now - self._heard, now
             raise DeviceSilent(
-                self.name,
+                self._label,
                 f"no valid measured value for {silent_s:.2f} s though the stream was started",
                 "Check the amplifier and its cable; it may have been switched off or reset.",
             )
         if (rate := clock.other_rate()) is not None:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"streams at {rate:.4g} Hz although {self._rate:.4g} Hz were set",
                 "The amplifier may have been reset, or the line loses data.",
             )
@@ -461,7 +463,7 @@ class GSV8:
         reply = yield from self._ask(command, parameters, lengths, delay_s)
         if reply.error > 0x01:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"{COMMANDS[command]} refused: {reply.meaning}",
                 "Check channel, rate and frame type against the amplifier, and that its settings are not locked.",
             )
@@ -484,7 +486,7 @@ class GSV8:
         (rate,) = struct.unpack(">f", data)
         if not abs(rate - self._rate) <= 0.01 * self._rate:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"data rate reads back as {rate:.6g} Hz after {self._rate:.6g} Hz was written",
                 "Choose a rate that the amplifier supports.",
             )
@@ -505,7 +507,7 @@ class GSV8:
         needed = self._frame_type != "float32" or self._user_scale_of == "range"
         if self._range is None and needed:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"input range unknown: GetInputType answered {reply.meaning}",
                 "State input_range_mV_per_V in the scene.",
             )
@@ -514,7 +516,7 @@ class GSV8:
         if self._frame_type == "float32":
             if not (math.isfinite(scale) and scale != 0 and math.isfinite(offset)):
                 raise DeviceRefused(
-                    self.name,
+                    self._label,
                     f"user scale of channel {self._channel} is {scale:g}, its user offset {offset:g}",
                     "Set them in the amplifier, to 1 and 0 say.",
                 )
@@ -537,16 +539,16 @@ class GSV8:
         """One measured frame on request: it shows type and number of channels, and the stream is held to them."""
         frame = yield from self._exchange(_Request(GET_VALUE))
         if isinstance(frame, Reply):
-            raise DeviceRefused(self.name, f"GetValue refused: {frame.meaning}", "Check the sensor and its cable.")
+            raise DeviceRefused(self._label, f"GetValue refused: {frame.meaning}", "Check the sensor and its cable.")
         if frame.type != self._frame_type:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"sends {frame.type} although {self._frame_type} was set",
                 f'Set frame_type = "{frame.type}" in the scene, or change it in the amplifier.',
             )
         if self._channel > len(frame.values):
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"has {len(frame.values)} channels, but channel {self._channel} was asked for",
                 "Correct the channel in the scene.",
             )

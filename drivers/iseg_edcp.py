@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import NamedTuple, TypeVar
 
-from drivers.dialogue import Answer, Ask, Dialogue
+from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, label
 from drivers.link import CanFrame, DeviceError, DeviceRefused, DeviceSilent, FrameLink
 from drivers.roles import HVFlag, HVSample, Identity
 
@@ -383,13 +383,17 @@ class IsegEDCP:
         timeout_s: float = 0.25,
         max_ramp_percent_per_s: float = 20.0,
     ) -> None:
+        where = label(name, link)
         if not 0 <= module <= 63:
-            raise DeviceRefused(name, f"module number {module} does not exist", "Allowed: 0 to 63.")
+            raise DeviceRefused(where, f"module number {module} does not exist", "Allowed: 0 to 63.")
         if not 0 <= channel <= 255:
-            raise DeviceRefused(name, f"channel {channel} does not exist", "Allowed: 0 to 255, as the module has them.")
+            raise DeviceRefused(
+                where, f"channel {channel} does not exist", "Allowed: 0 to 255, as the module has them."
+            )
         if not 0 < poll_rate_Hz <= 100:
-            raise DeviceRefused(name, f"poll rate {poll_rate_Hz} Hz is not possible", "Allowed: above 0, at most 100.")
+            raise DeviceRefused(where, f"poll rate {poll_rate_Hz} Hz is not possible", "Allowed: above 0, at most 100.")
         self.name = name
+        self._label = where
         self.identity = Identity(model="iseg EDCP")
         self.settings: dict[str, str] = {}
         self.counters: dict[str, int] = {"log_ons": 0, "unexpected_frames": 0, "bad_values": 0, "writes_repeated": 0}
@@ -398,11 +402,11 @@ class IsegEDCP:
         self._link = link
         self._module = module
         self._channel = channel
-        self._period = 1.0 / poll_rate_Hz
+        self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
         self._max_ramp = max_ramp_percent_per_s
         self._decoder = Decoder(module, self.counters)
         self._dialogue: Dialogue[_Exchange, Message] = Dialogue(
-            name,
+            where,
             self._transmit,
             self.counters,
             timeout_s=timeout_s,
@@ -415,7 +419,6 @@ class IsegEDCP:
         self._ready = False
         self._commands = 0
         self._samples: list[HVSample] = []
-        self._next_cycle = -math.inf
         self._next_survey = -math.inf
         self._next_poll = -math.inf
 
@@ -444,7 +447,7 @@ class IsegEDCP:
         percent = 100.0 * volts_per_second / self._nominal[0]
         if not 0.0 < percent <= self._max_ramp * (1 + 1e-6):
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"a ramp of {volts_per_second:g} V/s is {percent:g} % of {self._nominal[0]:g} V per second",
                 f"The module allows above 0, at most {self._max_ramp:g} %/s: "
                 f"{self._max_ramp / 100 * self._nominal[0]:g} V/s.",
@@ -455,7 +458,7 @@ class IsegEDCP:
         self._require_ready("set the current limit")
         if not 0.0 < amperes <= self._nominal[1]:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"a current limit of {amperes:g} A is outside the channel's range",
                 f"Allowed: above 0, at most {self._nominal[1]:g} A.",
             )
@@ -465,7 +468,7 @@ class IsegEDCP:
         self._require_ready("set the voltage")
         if not 0.0 <= volts <= self._nominal[0]:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"a set-point of {volts:g} V is outside the channel's range",
                 f"Allowed: 0 to {self._nominal[0]:g} V.",
             )
@@ -498,10 +501,10 @@ class IsegEDCP:
     def set_trip(self, delay_s: float, action: int) -> None:
         """What the module does after the current has been at its limit for ``delay_s``: see `TRIP_ACTIONS`."""
         if not 0.0 <= delay_s <= 4.095:
-            raise DeviceRefused(self.name, f"a trip delay of {delay_s:g} s is not possible", "Allowed: 0 to 4.095 s.")
+            raise DeviceRefused(self._label, f"a trip delay of {delay_s:g} s is not possible", "Allowed: 0 to 4.095 s.")
         if action not in TRIP_ACTIONS:
             allowed = ", ".join(f"{code} {text}" for code, text in TRIP_ACTIONS.items())
-            raise DeviceRefused(self.name, f"trip action {action} does not exist", f"Allowed: {allowed}.")
+            raise DeviceRefused(self._label, f"trip action {action} does not exist", f"Allowed: {allowed}.")
         self._command(self._write_setting(TRIP_DELAY, round(delay_s * 1000), self._channel, "trip_delay_ms"))
         self._command(self._write_setting(TRIP_ACTION, action, self._channel, "trip_action"))
 
@@ -510,7 +513,7 @@ class IsegEDCP:
         self._require_ready("set bounds")
         if not (0.0 <= volts <= self._nominal[0] and 0.0 <= amperes <= self._nominal[1]):
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"bounds of {volts:g} V and {amperes:g} A are outside the channel's range",
                 f"Allowed: 0 to {self._nominal[0]:g} V and 0 to {self._nominal[1]:g} A.",
             )
@@ -520,7 +523,7 @@ class IsegEDCP:
     # -- polling ----------------------------------------------------------------------------------------------------
 
     def poll(self, now: float) -> Sequence[HVSample]:
-        self._next_poll = now + self._period  # a port that is gone is not asked in a busy loop
+        self._next_poll = now + LOST_AGAIN_S
         for frame in self._link.read():
             message = self._decoder.feed(frame)
             if isinstance(message, LogOn):
@@ -534,15 +537,12 @@ class IsegEDCP:
             if not self._ready:
                 self._link.write(log_on(self._module))
                 self._dialogue.begin(self._set_up())
-            elif now >= self._next_cycle:
-                # Keep the beat, but do not run after beats that were missed.
-                beat = self._next_cycle + self._period
-                self._next_cycle = beat if beat > now else now + self._period
+            elif self._schedule.take(now):
                 self._dialogue.begin(self._cycle(now))
-        try:
-            self._dialogue.run(now)
-        finally:
-            self._next_poll = self._next_cycle if self._dialogue.idle else self._dialogue.next_poll(now)
+        self._dialogue.run(now)
+        if self._ready and math.isinf(self._schedule.due):
+            self._schedule.start(now)
+        self._next_poll = min(self._schedule.due if self._dialogue.idle else math.inf, self._dialogue.next_poll(now))
         samples, self._samples = self._samples, []
         return samples
 
@@ -563,7 +563,7 @@ class IsegEDCP:
 
     def _require_ready(self, what: str) -> None:
         if not self._ready:
-            raise DeviceRefused(self.name, f"cannot {what} before the set-up dialogue has ended", "Poll it first.")
+            raise DeviceRefused(self._label, f"cannot {what} before the set-up dialogue has ended", "Poll it first.")
 
     def _transmit(self, exchange: _Exchange) -> Callable[[Message], bool]:
         for frame in exchange.writes:
@@ -619,7 +619,7 @@ class IsegEDCP:
                 return value, answer.t
             self.counters["bad_values"] += 1
         raise DeviceRefused(
-            self.name,
+            self._label,
             f"reports {value:g} as {item.title}",
             f"Possible: at most {limit:g}. Switch off by hand and check the module.",
         )
@@ -636,7 +636,7 @@ class IsegEDCP:
         yield from self._integer(MODULE_STATUS)
         if self.counters["foreign_requests"] != foreign:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"someone else reads from module {self._module}, or the CAN interface returns its own frames",
                 "Writes could not be verified. End the other program, or switch receive_own_messages off.",
             )
@@ -647,7 +647,7 @@ class IsegEDCP:
         self._channels = channels if isinstance(channels, int) else 1
         if isinstance(channels, int) and not self._channel < channels:
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"module {self._module} has {channels} channel(s), but channel {self._channel} was asked for",
                 f"Channels count from 0: allowed is 0 to {channels - 1}.",
             )
@@ -660,7 +660,7 @@ class IsegEDCP:
         amperes, _ = yield from self._number(NOMINAL_CURRENT, 1e3)
         if not (volts > 0 and amperes > 0):
             raise DeviceRefused(
-                self.name,
+                self._label,
                 f"states nominal values of {volts:g} V and {amperes:g} A",
                 "Only positive ones are supported.",
             )
@@ -722,7 +722,7 @@ class IsegEDCP:
             if read_back == value or (isinstance(read_back, float) and math.isclose(read_back, value, rel_tol=1e-5)):
                 return
         raise DeviceRefused(
-            self.name,
+            self._label,
             f"{item.title} reads back as {read_back!r} after {value!r} was written",
             "The module does not accept it: check its limits, its state, and who else commands it.",
         )
@@ -747,7 +747,7 @@ class IsegEDCP:
         if events or status & ChannelStatus.EMERGENCY_OFF:
             causes = _names(events) or "EMERGENCY_OFF"
             raise DeviceRefused(
-                self.name, f"is not switched on while {causes} is latched", "Find the cause, then clear."
+                self._label, f"is not switched on while {causes} is latched", "Find the cause, then clear."
             )
         if status & ChannelStatus.ON:
             return
@@ -761,7 +761,7 @@ class IsegEDCP:
             control = yield from self._integer(CHANNEL_CONTROL, delay_s=_SWITCH_ON_WAIT_S)
         events = ChannelEvents((yield from self._integer(CHANNEL_EVENTS)))
         raise DeviceRefused(
-            self.name,
+            self._label,
             f"did not switch on: control {control:04X}, status {_names(status) or 'off'}, "
             f"events {_names(events & BLOCKING) or 'none'}",
             "Check safety loop, inhibit input and limits, then try again.",
@@ -778,7 +778,7 @@ class IsegEDCP:
         except DeviceError as error:
             self._link.write(EMERGENCY_OFF_ALL)
             raise type(error)(
-                self.name,
+                self._label,
                 f"EMERGENCY OFF IS NOT CONFIRMED ({error.what}); it was sent to all modules on the bus as well",
                 "Take the high voltage away by hand: safety loop or mains switch, then ground the electrodes.",
             ) from error
@@ -789,7 +789,7 @@ class IsegEDCP:
         left = ChannelEvents((yield from self._acknowledge(CHANNEL_EVENTS, self._channel))) & BLOCKING
         if left:
             raise DeviceRefused(
-                self.name, f"{_names(left)} comes back after it was cleared", "Its cause persists: remove it first."
+                self._label, f"{_names(left)} comes back after it was cleared", "Its cause persists: remove it first."
             )
 
     def _acknowledge(self, item: Item, channel: int | None) -> Script[int]:
