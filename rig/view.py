@@ -18,20 +18,25 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.shape import meridians
 from rig.clock import RealClock
 from rig.errors import ConfigError, RigError
 from rig.log.dataset import Run, load_run
 from rig.log.text import printable
+from rig.scene import Scene
+from rig.toml_file import parse_table
 
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
     from rerun.experimental import ViewerClient
+
+    from model.specimen import Specimen
 
 TIMELINE = "run"
 WINDOW = "1600x1000"
@@ -96,19 +101,21 @@ def view(log_path: Path, *, save: Path | None = None, screenshot: Path | None = 
 def _write_recording(run: Run, path: Path) -> None:
     import rerun as rr
 
+    film = _film(run)
     recording = rr.RecordingStream("dea_rig", recording_id=run.log.path.name)
-    recording.save(path, default_blueprint=_blueprint(run))
+    recording.save(path, default_blueprint=_blueprint(run, film))
     recording.send_recording_name(run.log.path.name)
     _add_series(recording, run)
     _add_phases(recording, run)
     _add_loop(recording, run)
+    _add_film(recording, film)
     _add_events(recording, run)
     recording.log(ABOUT, rr.TextDocument(_about(run), media_type=rr.MediaType.MARKDOWN), static=True)
     recording.flush()
     recording.disconnect()
 
 
-def _blueprint(run: Run) -> rrb.Blueprint:
+def _blueprint(run: Run, film: _Film) -> rrb.Blueprint:
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -130,10 +137,13 @@ def _blueprint(run: Run) -> rrb.Blueprint:
         name="Force over displacement",
         visual_bounds=rrb.VisualBounds2D(x_range=(-0.16 * width, 1.12 * width), y_range=(-1.1 * height, 0.22 * height)),
     )
-    film = rrb.Spatial3DView(
+    size = float(film.r.max(initial=1.0))
+    film_view = rrb.Spatial3DView(
         origin=FILM,
-        name="Film, as computed (mm; colour: true electric field)" if run.has_hv else "Film, as computed (mm)",
-        eye_controls=rrb.EyeControls3D(position=(26.0, -34.0, 26.0), look_target=(0.0, 0.0, 1.0), eye_up=(0, 0, 1)),
+        name=film.title,
+        eye_controls=rrb.EyeControls3D(
+            position=(1.1 * size, -1.5 * size, 1.1 * size), look_target=(0.0, 0.0, 0.15 * size), eye_up=(0.0, 0.0, 1.0)
+        ),
         line_grid=rrb.LineGrid3D(visible=False),
     )
     notes = rrb.Tabs(
@@ -150,7 +160,7 @@ def _blueprint(run: Run) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(*plots, lanes, row_shares=[3.0] * len(plots) + [2.4]),
-            rrb.Vertical(rrb.Horizontal(loop), film, notes, row_shares=[4.0, 4.0, 2.4]),
+            rrb.Vertical(loop, film_view, notes, row_shares=[4.0, 4.0, 2.4]),
             column_shares=[5.0, 4.0],
         ),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
@@ -265,6 +275,108 @@ def _add_loop(recording: rr.RecordingStream, run: Run) -> None:
         indexes=[_times(run.t[rows])],
         columns=rr.Points2D.columns(positions=place(run.h[rows] * 1e3, run.force[rows])),
     )
+
+
+class _Film(NamedTuple):
+    """Meridians to draw, in millimetres: (instants, rings) each; ``share`` is 0 to 1 of what the colour shows."""
+
+    t: NDArray[np.float64]
+    r: NDArray[np.float64]
+    z: NDArray[np.float64]
+    share: NDArray[np.float64]
+    title: str
+
+
+def _film(run: Run) -> _Film:
+    """The film at some instants, as the scene's material has it at the displacement and voltage logged then."""
+    nothing = np.empty((0, RINGS + 1))
+    specimen = _specimen(run)
+    rows = _film_rows(run)
+    if specimen is None or not rows.size:
+        return _Film(np.empty(0), nothing, nothing, nothing, "Film (not known)")
+    shape = meridians(specimen, run.h[rows], np.maximum(run.voltage[rows], 0.0), RINGS + 1)
+    taut = np.isfinite(shape.r).all(axis=1)
+    shown, unit = (shape.field[taut] * 1e-6, "V/µm") if run.has_hv else (shape.thinning[taut], "times")
+    low, high = 0.0 if run.has_hv else 1.0, float(shown.max(initial=1.0))
+    what = "true electric field" if run.has_hv else "thinning"
+    title = f"Film of the scene's material; {what}: dark {low:g}, yellow {high:.3g} {unit}"
+    share = (shown - low) / max(high - low, 1e-30)
+    return _Film(run.t[rows[taut]], shape.r[taut] * 1e3, shape.z[taut] * 1e3, share, title)
+
+
+def _add_film(recording: rr.RecordingStream, film: _Film) -> None:
+    import rerun as rr
+
+    if not film.t.size:
+        return
+    angle = np.linspace(0.0, 2.0 * np.pi, SECTORS, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(SECTORS)], axis=-1)
+    up = np.array([0.0, 0.0, 1.0])
+
+    def turned(radial: NDArray[np.float64], axial: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(instants, rings) to vectors of shape (instants, rings, sectors, 3)."""
+        vectors: NDArray[np.float64] = radial[:, :, None, None] * circle + axial[:, :, None, None] * up
+        return vectors
+
+    positions = turned(film.r, film.z)
+    normals = turned(-np.gradient(film.z, axis=1), np.gradient(film.r, axis=1))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    colours = np.repeat(_heat(film.share)[:, :, None, :], SECTORS, axis=2)
+    recording.log(f"{FILM}/surface", rr.Mesh3D.from_fields(triangle_indices=_triangles()), static=True)
+    recording.send_columns(
+        f"{FILM}/surface",
+        indexes=[_times(film.t)],
+        columns=rr.Mesh3D.columns(
+            vertex_positions=positions.reshape(-1, 3).astype(np.float32),
+            vertex_normals=normals.reshape(-1, 3).astype(np.float32),
+            vertex_colors=colours.reshape(-1, 3),
+        ).partition([(RINGS + 1) * SECTORS] * film.t.size),
+    )
+    closed = np.concatenate([positions, positions[:, :, :1]], axis=2)[:, :: RINGS // 6]  # some of the circles
+    for k in range(closed.shape[1]):
+        edge = k in (0, closed.shape[1] - 1)
+        style = rr.LineStrips3D.from_fields(
+            colors=[INK if edge else (40, 44, 50)], radii=rr.Radius.ui_points(2.0 if edge else 0.6)
+        )
+        recording.log(f"{FILM}/circle_{k}", style, static=True)
+        recording.send_columns(
+            f"{FILM}/circle_{k}",
+            indexes=[_times(film.t)],
+            columns=rr.LineStrips3D.columns(strips=list(closed[:, k].astype(np.float32))),
+        )
+
+
+def _specimen(run: Run) -> Specimen | None:
+    """The specimen of the scene in the log; None when there is no scene that this version understands."""
+    if "scene.toml" not in run.log.attachments:
+        return None
+    try:
+        return parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)").specimen.specimen()
+    except ConfigError:
+        return None
+
+
+def _film_rows(run: Run) -> NDArray[np.intp]:
+    """Instants to draw: evenly spread over the time in which the displacement is known, the farthest one included."""
+    known = np.flatnonzero(np.isfinite(run.h) & np.isfinite(run.voltage) & (run.h >= 0.0))
+    if not known.size:
+        return known
+    even = known[np.linspace(0, known.size - 1, FILM_INSTANTS).astype(np.intp)]
+    return np.unique([*even, known[np.argmin(np.abs(run.t[known] - _best_instant(run)))]])
+
+
+def _triangles() -> NDArray[np.uint32]:
+    ring, sector = np.meshgrid(np.arange(RINGS), np.arange(SECTORS), indexing="ij")
+    a, b = ring * SECTORS + sector, ring * SECTORS + (sector + 1) % SECTORS
+    quads = np.stack([a, b, b + SECTORS, a, b + SECTORS, a + SECTORS], axis=-1)
+    return quads.reshape(-1, 3).astype(np.uint32)
+
+
+def _heat(share: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """From dark blue over teal to yellow, rising in lightness (after the viridis map)."""
+    stops = np.array([(68, 60, 130), (49, 104, 142), (31, 158, 137), (110, 205, 88), (253, 231, 37)], dtype=np.float64)
+    at = np.linspace(0.0, 1.0, len(stops))
+    return np.stack([np.interp(share, at, stops[:, channel]) for channel in range(3)], axis=-1).astype(np.uint8)
 
 
 def _add_events(recording: rr.RecordingStream, run: Run) -> None:

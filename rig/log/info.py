@@ -50,7 +50,7 @@ def _devices(log: Log) -> list[str]:
     said: dict[str, str] = {}
     for message in log.messages("/event"):
         if message.fields["message"].startswith("model "):
-            said.setdefault(message.fields["source"], message.fields["message"])
+            said.setdefault(message.fields["source"], message.fields["message"].split(";")[0])  # not its settings
     for role in ROLES:
         if any(topic.startswith((f"/{role}/", f"/raw/{role}/")) for topic in log.topics):
             lines.append(_row(role, said.get(role, "")))
@@ -76,7 +76,7 @@ def _table(title: str, table: dict[str, str]) -> list[str]:
 
 
 def _row(name: str, value: str) -> str:
-    return f"  {printable(name):<24}{printable(value)}"
+    return f"  {printable(name):<27} {printable(value)}"
 
 
 def _most(lines: list[str]) -> list[str]:

@@ -19,6 +19,9 @@ HAS_DRIVER = any(
 )
 
 
+SCENES = Path(__file__).resolve().parents[2] / "sim_fixtures" / "scenes"
+
+
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     """Two ramps, at 0 V and at 1000 V, and an event with a control character in it."""
@@ -28,6 +31,7 @@ def log(tmp_path: Path) -> Path:
         def write(topic: str, t: float, **fields: object) -> None:
             writer.write(topic, {"t_s": t, **fields}, round(t * 1e9), round(t * 1e9))
 
+        writer.attach("scene.toml", "application/toml", (SCENES / "cone-4mm.toml").read_bytes())
         writer.metadata("run", {"scene": "two ramps"})
         write("/event", 0.0, severity="warning", source="force", message="red \x1b[31m alert")
         for k in range(400):
@@ -77,6 +81,7 @@ def test_a_saved_recording_holds_the_log(log, tmp_path):
         "/loop/0_V",
         "/loop/1000_V",
         "/loop/now",
+        "/film/surface",
         "/events",
         "/about",
     } <= entities

@@ -1,0 +1,51 @@
+import math
+
+import numpy as np
+import pytest
+
+from model.materials import NAMED
+from model.membrane import solve
+from model.shape import meridians
+from model.specimen import Specimen
+
+SPECIMEN = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
+STATES = [(1e-3, 0.0), (6e-3, 0.0), (6e-3, 1500.0), (11e-3, 1000.0)]
+
+
+def test_clamped_at_disk_and_ring():
+    h, v = np.array(STATES).T
+    shape = meridians(SPECIMEN, h, v, 25)
+    np.testing.assert_allclose(shape.r[:, [0, -1]], [[4e-3, 20e-3]] * len(h), rtol=1e-12)
+    np.testing.assert_allclose(shape.z[:, 0], h, rtol=1e-4)
+    assert (shape.z[:, -1] == 0.0).all()
+
+
+@pytest.mark.parametrize(("h", "voltage"), STATES)
+def test_every_ring_carries_the_force(h, voltage):
+    """Axial balance 2 pi r t s1 sin(phi) = F, with stretches by differences of the drawn shape and Ogden's stress."""
+    shape = meridians(SPECIMEN, np.array([h]), np.array([voltage]), 401)
+    r, z = shape.r[0], shape.z[0]
+    flat = np.geomspace(4e-3, 20e-3, 401)
+    dr, dz, middle = np.diff(r), np.diff(z), 0.5 * (r[1:] + r[:-1])
+    l1 = 1.2 * np.hypot(dr, dz) / np.diff(flat)
+    l2 = 1.2 * middle / (0.5 * (flat[1:] + flat[:-1]))
+    material = SPECIMEN.material
+    s1 = sum(mu * (l1**alpha - (l1 * l2) ** -alpha) for mu, alpha in zip(material.mu, material.alpha, strict=True))
+    field = voltage * l1 * l2 / SPECIMEN.thickness
+    s1 = s1 - 8.8541878128e-12 * material.eps_r * field**2
+    force = 2 * math.pi * middle * (SPECIMEN.thickness / (l1 * l2)) * s1 * -dz / np.hypot(dr, dz)
+    np.testing.assert_allclose(force, solve(SPECIMEN, h, voltage).force, rtol=2e-3)
+    np.testing.assert_allclose(0.5 * (shape.field[0, 1:] + shape.field[0, :-1]), field, rtol=1e-3)
+
+
+def test_what_is_not_taut_is_not_drawn():
+    shape = meridians(SPECIMEN, np.array([1e-3, math.nan, 6e-3]), np.array([50e3, 0.0, 0.0]), 9)
+    assert np.isnan(shape.r[:2]).all()
+    assert np.isfinite(shape.r[2]).all()
+    assert meridians(SPECIMEN, np.array([]), np.array([]), 9).r.shape == (0, 9)
+
+
+def test_pulled_and_pushed():
+    shape = meridians(SPECIMEN, np.array([5e-3, -5e-3]), np.zeros(2), 9)
+    np.testing.assert_allclose(shape.z[0], -shape.z[1])
+    np.testing.assert_allclose(shape.r[0], shape.r[1])
