@@ -1,11 +1,12 @@
 r"""The mounted film as a table: its force at any indentation and voltage, for instruments that ask all day.
 
-The membrane solver is asked once, at Chebyshev nodes; what is interpolated is smooth and even in the indentation s:
+The membrane solver is asked once, at nodes; what is interpolated is smooth and even in the indentation s:
 
 .. math:: F = s\,G(w, u), \quad w = (s/s_{max})^2, \quad u = (V/V_c(w))^2
 
-where V_c is a smooth bound just above the voltage at which the film breaks down at that indentation. The
-interpolation is checked against the solver between the nodes before it is used.
+where V_c is a smooth bound just above the voltage at which the film breaks down at that indentation and G is a
+Chebyshev series, checked against the solver between its nodes before it is used. A film that goes slack below its
+breakdown voltage (no pre-stretch) has kinks there, which no such series follows; the check refuses it.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from model.specimen import Specimen
+from rig.errors import ConfigError
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -28,16 +29,16 @@ Solve = Callable[[Specimen, Floats, Floats], tuple[Floats, Floats, Bools]]
 
 TOLERANCE = 1e-5  # interpolation error aimed at, of the largest force in the table
 WORST = 1e-3  # above this no table is made
-SIZES = ((20, 8), (30, 12), (44, 18))
-BREAKDOWN_SIZE = 20
+SIZES = ((20, 8), (30, 12))
+BREAKDOWN_NODES = 40
 BREAKDOWN_TOLERANCE = 1e-4
-BOUND_DEGREE = 5
+BOUND_DEGREE = 10
 DEFAULT_FIELD = 80e6  # V/m, where the material names no breakdown field
 REACH = 1.25  # largest indentation, in widths of the annulus; beyond it the film tears
 
 
-class FilmTableError(Exception):
-    """The film's behaviour cannot be tabulated; the simulated bench cannot be made."""
+class FilmTableError(ConfigError):
+    """The film of this scene cannot be simulated."""
 
 
 def solve_membrane(specimen: Specimen, h: Floats, voltage: Floats) -> tuple[Floats, Floats, Bools]:
@@ -51,33 +52,8 @@ def solve_membrane(specimen: Specimen, h: Floats, voltage: Floats) -> tuple[Floa
     return np.where(slack, 0.0, solutions.force), np.where(slack, 0.0, solutions.peak_field), found
 
 
-def _nodes(n: int) -> Floats:
-    """Chebyshev nodes of the first kind on (0, 1)."""
-    nodes: Floats = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / n)
-    return nodes
-
-
-def _coefficients(values: Floats) -> Floats:
-    """Chebyshev coefficients on (0, 1) from values at `_nodes`, along the first axis."""
-    n = values.shape[0]
-    basis = np.cos(np.outer(np.arange(n), np.pi * (1.0 - (np.arange(n) + 0.5) / n)))
-    basis[0] *= 0.5
-    coefficients: Floats = np.tensordot(basis, values, axes=(1, 0)) * (2.0 / n)
-    return coefficients
-
-
-def _clenshaw(coefficients: Floats, x: Floats) -> Floats:
-    """Sum of c_k T_k(2 x - 1) over the first axis of ``coefficients`` (k, ..., 1 or n), for x (n,)."""
-    y = 4.0 * x - 2.0  # twice the argument of T_k
-    b1 = b2 = np.zeros_like(x)
-    for c in coefficients[:0:-1]:
-        b1, b2 = c + y * b1 - b2, b1
-    total: Floats = coefficients[0] + 0.5 * y * b1 - b2
-    return total
-
-
-def _clenshaw_at(coefficients: list[float], x: float) -> float:
-    """The same for one x: plain numbers, because instruments ask one at a time."""
+def _clenshaw(coefficients: list[float], x: float) -> float:
+    """Sum of c_k T_k(2 x - 1)."""
     y = 4.0 * x - 2.0
     b1 = b2 = 0.0
     for c in coefficients[:0:-1]:
@@ -99,76 +75,80 @@ class FilmTable:
 
     reach: float
     error: float
-    _force: Floats  # Chebyshev coefficients of G, (n_w, n_u)
-    _bound: Floats | None  # of V_c, (few,); None where no voltage ever comes
-    _breakdown: Floats | None  # of the breakdown voltage, (n_w,), which has kinks
+    _columns: list[list[float]]  # Chebyshev coefficients of G: for each power of u those in w
+    _bound: list[float]  # Chebyshev coefficients of V_c in w; empty where no voltage ever comes
+    _breakdown: list[float]  # breakdown voltage at equal steps of s/s_max; it has kinks
 
-    def _w(self, s: Floats) -> Floats:
-        x = np.minimum(s / self.reach, 1.0)
-        w: Floats = x * x
-        return w
+    def _w(self, s: float) -> float:
+        x = min(s / self.reach, 1.0)
+        return x * x
 
-    def force(self, s: Floats, voltage: Floats | None = None) -> Floats:
-        """Equilibrium force (N) at indentation ``s`` (m) and ``voltage`` (V), both (n,); at 0 V when it is left out."""
+    def force(self, s: float, voltage: float) -> float:
+        """Equilibrium force (N) at indentation ``s`` (m) and ``voltage`` (V)."""
         w = self._w(s)
-        if self._bound is None:
-            return s * _clenshaw(self._force[:, 0], w)
-        ratio = 0.0 if voltage is None else voltage / _clenshaw(self._bound, w)
-        u = np.minimum(ratio * ratio, 1.0) + np.zeros_like(w)
-        return s * _clenshaw(_clenshaw(self._force[:, :, None], w), u)
-
-    def force_at(self, s: float, voltage: float) -> float:
-        """`force` at one indentation and voltage."""
-        x = min(s / self.reach, 1.0)
-        w = x * x
-        columns, bound, _ = self._lists
         u = 0.0
-        if bound:
-            ratio = voltage / _clenshaw_at(bound, w)
+        if self._bound:
+            ratio = voltage / _clenshaw(self._bound, w)
             u = min(ratio * ratio, 1.0)
-        return s * _clenshaw_at([_clenshaw_at(column, w) for column in columns], u)
+        return s * _clenshaw([_clenshaw(column, w) for column in self._columns], u)
 
-    def breakdown_voltage_at(self, s: float) -> float:
+    def breakdown_voltage(self, s: float) -> float:
         """Voltage (V) at which the peak field reaches the film's strength at indentation ``s`` (m)."""
-        _, _, breakdown = self._lists
-        x = min(s / self.reach, 1.0)
-        return _clenshaw_at(breakdown, x * x) if breakdown else math.inf
+        if not self._breakdown:
+            return math.inf
+        steps = len(self._breakdown) - 1
+        x = min(s / self.reach, 1.0) * steps
+        i = min(int(x), steps - 1)
+        return self._breakdown[i] + (x - i) * (self._breakdown[i + 1] - self._breakdown[i])
 
-    @cached_property
-    def _lists(self) -> tuple[list[list[float]], list[float], list[float]]:
-        """Columns of G, V_c and breakdown voltage as plain numbers; empty where there is none."""
-        return (
-            self._force.T.tolist(),
-            [] if self._bound is None else self._bound.tolist(),
-            [] if self._breakdown is None else self._breakdown.tolist(),
-        )
+    def bound(self, s: float) -> float:
+        """Largest voltage (V) in the table at indentation ``s`` (m)."""
+        return _clenshaw(self._bound, self._w(s)) if self._bound else 0.0
 
-    def bound(self, s: Floats) -> Floats:
-        """Largest voltage (V) in the table at indentation ``s`` (n,)."""
-        return np.full_like(s, np.inf) if self._bound is None else _clenshaw(self._bound, self._w(s))
+
+def _nodes(n: int) -> Floats:
+    """Chebyshev nodes of the first kind on (0, 1)."""
+    nodes: Floats = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / n)
+    return nodes
+
+
+def _series(values: Floats) -> Floats:
+    """Chebyshev coefficients from values at the nodes, along the first axis."""
+    n = values.shape[0]
+    basis = np.cos(np.outer(np.arange(n), np.pi * (1.0 - (np.arange(n) + 0.5) / n)))
+    basis[0] *= 0.5
+    coefficients: Floats = basis @ values * (2.0 / n)
+    return coefficients
+
+
+def _columns(values: Floats) -> list[list[float]]:
+    """Chebyshev coefficients from values at the nodes (n_w, n_u), a list in w for each in u."""
+    columns: list[list[float]] = _series(_series(values).T).tolist()
+    return columns
 
 
 def tabulate(specimen: Specimen, compliance: float, with_voltage: bool, solve: Solve = solve_membrane) -> FilmTable:
     """Make the table for ``specimen`` on a rig of ``compliance`` (m/N): s = displacement + compliance x force."""
     reach = REACH * (specimen.ring_radius - specimen.disk_radius)
-    empty = FilmTable(reach, np.inf, np.zeros((1, 1)), None, None)
+    bare = FilmTable(reach, math.inf, [[0.0]], [], [])
     if with_voltage:
-        w = _nodes(BREAKDOWN_SIZE)
-        at_nodes = _breakdown(specimen, reach * np.sqrt(w), solve)
-        fit = np.polynomial.Chebyshev.fit(w, at_nodes, BOUND_DEGREE, domain=(0.0, 1.0))
-        bound = np.asarray(fit.coef, dtype=np.float64) * float(np.max(at_nodes / fit(w)))
-        empty = replace(empty, _bound=bound, _breakdown=_coefficients(at_nodes))
-    best = empty
+        x = np.linspace(0.0, 1.0, BREAKDOWN_NODES)
+        x[0] = 1e-3
+        breakdown = _breakdown(specimen, reach * x, solve)
+        fit = np.polynomial.Chebyshev.fit(x * x, breakdown, BOUND_DEGREE, domain=(0.0, 1.0))
+        above = float(np.max(breakdown / fit(x * x)))
+        bare = replace(bare, _bound=[float(c) * above for c in fit.coef], _breakdown=breakdown.tolist())
+    largest = float(solve(specimen, np.array([reach]), np.zeros(1))[0][0])
+    best = bare
     for n_w, n_u in SIZES:
-        table = _fit(specimen, compliance, empty, n_w, n_u if with_voltage else 1, solve)
+        table = _fit(specimen, compliance, bare, _nodes(n_w), _nodes(n_u if with_voltage else 1), solve)
         best = min(best, table, key=lambda one: one.error)
-        largest = float(best.force(np.array([reach]))[0])
         if best.error <= TOLERANCE * largest:
             return best
     if not best.error <= WORST * largest:
         raise FilmTableError(
-            f"the film of specimen {specimen.name!r} cannot be tabulated: the interpolation is wrong by up to"
-            f" {best.error:.2g} N. Films that wrinkle do this; simulate more pre-stretch, or leave out the HV supply"
+            f"the film of specimen {specimen.name!r} cannot be simulated: its table is wrong by up to"
+            f" {best.error:.2g} N; simulate more pre-stretch, or leave out the HV supply"
         )
     return best
 
@@ -190,44 +170,42 @@ def _breakdown(specimen: Specimen, h: Floats, solve: Solve) -> Floats:
     raise FilmTableError(f"the film of specimen {specimen.name!r} has no stable state below its breakdown")
 
 
-def _fit(specimen: Specimen, compliance: float, empty: FilmTable, n_w: int, n_u: int, solve: Solve) -> FilmTable:
-    h = empty.reach * np.sqrt(_nodes(n_w))
-    voltage = np.zeros((n_w, 1))
-    if n_u > 1:
-        voltage = empty.bound(h)[:, None] * np.sqrt(_nodes(n_u))
-    force, _, found = solve(specimen, np.broadcast_to(h[:, None], voltage.shape), voltage)
+def _fit(specimen: Specimen, compliance: float, bare: FilmTable, w: Floats, u: Floats, solve: Solve) -> FilmTable:
+    s = bare.reach * np.sqrt(w)
+    voltage = np.array([[bare.bound(one) for one in s.tolist()]]).T * np.sqrt(u)
+    force, _, found = solve(specimen, np.broadcast_to(s[:, None], voltage.shape), voltage)
     if not found.all():
         i, j = np.argwhere(~found)[0]
-        raise FilmTableError(f"no membrane solution for the film at {h[i] * 1e3:.4g} mm and {voltage[i, j]:.4g} V")
-    table = replace(empty, _force=_coefficients(_coefficients(force / h[:, None]).T).T)
+        raise FilmTableError(f"no membrane solution for the film at {s[i] * 1e3:.4g} mm and {voltage[i, j]:.4g} V")
+    table = replace(bare, _columns=_columns(force / s[:, None]))
     if compliance > 0:
-        table = _on_rig(table, compliance, h, n_u)
-    return replace(table, error=_check(specimen, table, compliance, n_w, n_u, solve))
+        shared = [
+            [_shared(table, compliance, one, v) for v in row]
+            for one, row in zip(s.tolist(), voltage.tolist(), strict=True)
+        ]
+        table = replace(bare, _columns=_columns(np.array(shared) / s[:, None]))
+    return replace(table, error=_check(specimen, table, compliance, w, u, solve))
 
 
-def _on_rig(table: FilmTable, compliance: float, s: Floats, n_u: int) -> FilmTable:
-    """The same table against indentation of film and rig together instead of displacement of the film."""
-    force = np.empty((len(s), n_u))
-    bound = table.bound(s)
-    for j, u in enumerate(_nodes(n_u)):
-        voltage = None if n_u == 1 else np.sqrt(u) * bound
-        low, high = np.zeros_like(s), s
-        for _ in range(60):
-            h = 0.5 * (low + high)
-            short = h + compliance * table.force(h, voltage) < s
-            low, high = np.where(short, h, low), np.where(short, high, h)
-        force[:, j] = table.force(h, voltage)
-    return replace(table, _force=_coefficients(_coefficients(force / s[:, None]).T).T)
+def _shared(film: FilmTable, compliance: float, s: float, voltage: float) -> float:
+    """Force (N) when film and rig share the way ``s``."""
+    low, high = 0.0, s
+    for _ in range(50):
+        h = 0.5 * (low + high)
+        if h + compliance * film.force(h, voltage) < s:
+            low = h
+        else:
+            high = h
+    return film.force(h, voltage)
 
 
-def _check(specimen: Specimen, table: FilmTable, compliance: float, n_w: int, n_u: int, solve: Solve) -> float:
-    """Largest difference (N) between table and solver at points between the nodes and at the edges."""
-    x = np.arange(n_w + 1) / n_w
-    u = np.arange(n_u + 1) / n_u if n_u > 1 else np.zeros(1)
-    s = table.reach * np.sqrt(np.repeat(np.maximum(0.5 - 0.5 * np.cos(np.pi * x), 1e-4), len(u)))
-    voltage = np.zeros_like(s)
-    if n_u > 1:
-        voltage = np.sqrt(np.tile(0.5 - 0.5 * np.cos(np.pi * u), n_w + 1)) * table.bound(s)
-    force = table.force(s, voltage)
+def _check(specimen: Specimen, table: FilmTable, compliance: float, w: Floats, u: Floats, solve: Solve) -> float:
+    """Largest difference (N) between table and solver midway between the nodes and at the edges."""
+    w = np.concatenate([[1e-4], 0.5 * (w[1:] + w[:-1]), [1.0]])
+    u = np.concatenate([[0.0], 0.5 * (u[1:] + u[:-1]), [1.0]])
+    points = [(table.reach * math.sqrt(a), math.sqrt(b)) for a in w.tolist() for b in u.tolist()]
+    s = np.array([one for one, _ in points])
+    voltage = np.array([part * table.bound(one) for one, part in points])
+    force = np.array([table.force(*point) for point in zip(s.tolist(), voltage.tolist(), strict=True)])
     exact, _, found = solve(specimen, s - compliance * force, voltage)
-    return float(np.max(np.abs(force - exact))) if found.all() else float("inf")
+    return float(np.max(np.abs(force - exact))) if found.all() else math.inf

@@ -130,10 +130,10 @@ class World:
         return s if self.torn else s - self._compliance * self._equilibrium(s, t)
 
     def _equilibrium(self, s: float, t: float) -> float:
-        return self.film.force_at(s, self.output.at(t)[0]) if s > 0 else 0.0
+        return self.film.force(s, self.output.at(t)[0]) if s > 0 else 0.0
 
     def _elastic_force(self, s: float) -> float:
-        return self.film.force_at(s, 0.0) if s > 0 else 0.0
+        return self.film.force(s, 0.0) if s > 0 else 0.0
 
     # At many times, for whoever looks at the truth
 
@@ -203,7 +203,7 @@ class World:
             self.torn = True
         voltage = self.output.at(t)[0]
         if voltage > 0 and not self.broken_down:
-            self.broken_down = voltage >= self.film.breakdown_voltage_at(s)
+            self.broken_down = voltage >= self.film.breakdown_voltage(s)
 
 
 def _relax(q: float, ratio: float, tau: float, dt: float, rise: float) -> float:

@@ -260,3 +260,16 @@ def test_current_bounds_and_event_mask(host):
     assert events(host) & 1 << 10
     assert int(host.can("201#1000")[0][-4:], 16) & 1 << 11
     assert host.can("201#1004") == ["200#10040001"]
+
+
+def test_ramping_a_film_beyond_its_strength_trips_the_supply(host):
+    """80 MV/m on 40 um: the closed-form film arcs at 3200 V."""
+    host.can("200#10014000")
+    on(host, 3300.0)
+    highest = 0.0
+    for _ in range(1200):
+        host.wait(0.005, 0.005)
+        highest = max(highest, output(host))
+    assert host.bench.world.broken_down
+    assert highest == pytest.approx(3200.0, abs=600 * 0.02 + 1)
+    assert output(host) == 0 and status(host) & TRIP

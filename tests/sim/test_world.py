@@ -52,7 +52,7 @@ def test_without_supply_no_voltage_is_tabulated():
     w = world(has_hv=False)
     w.stage.rest(0.0, CONTACT + 8e-3)
     assert at(w.force, 1.0) == pytest.approx(exact(at(w.displacement, 1.0)), abs=1e-6)
-    assert w.film.breakdown_voltage_at(8e-3) == np.inf
+    assert w.film.breakdown_voltage(8e-3) == np.inf
 
 
 def test_film_is_not_asked_for_until_it_matters():
@@ -134,7 +134,7 @@ def test_a_film_that_cannot_be_interpolated_is_refused():
     def kinked(specimen, h, voltage):
         return np.where(h > 9.7e-3, 1.0, 0.2) * h, voltage / THICKNESS, np.ones_like(h, dtype=bool)
 
-    with pytest.raises(FilmTableError, match="cannot be tabulated"):
+    with pytest.raises(FilmTableError, match="cannot be simulated"):
         tabulate(specimen(), 0.0, False, kinked)
 
 
@@ -156,5 +156,5 @@ def paper_table(disk_radius: float) -> FilmTable:
 def test_table_of_the_paper_film_against_reference_forces(disk_radius, h, voltage, force):
     """Three formulations and a finite element model agree on these numbers (b = 20 mm, T = 40 um, lp = 1.2)."""
     table = paper_table(disk_radius)
-    assert table.force_at(h, voltage) == pytest.approx(force, abs=2 * table.error + 1e-9)
-    assert table.error <= 1e-5 * table.force_at(table.reach, 0.0)
+    assert table.force(h, voltage) == pytest.approx(force, abs=2 * table.error + 1e-9)
+    assert table.error <= 1e-5 * table.force(table.reach, 0.0)
