@@ -215,11 +215,11 @@ class SimulatedBench:
 
     def _switch_device(self, fault: Fault, number: int, begins: bool, t: float) -> None:
         instrument = self.instruments[fault.role]
-        if isinstance(instrument, ZaberStage | KeyenceLKG) and fault.kind in ("alert", "interleave"):
-            if fault.kind == "alert":
-                self._alert(instrument, fault, begins, t)
-            else:
+        if isinstance(instrument, ZaberStage | KeyenceLKG) and fault.kind == "alert":
+            if fault.value == 0:
                 instrument.before_reply = self._interleave(instrument, fault, number) if begins else None
+            else:
+                self._alert(instrument, fault, begins, t)
             return
         if fault.kind == "reset":
             if begins:

@@ -18,9 +18,9 @@ Role = Literal["stage", "force", "displacement", "hv"]
 
 LINK_FAULTS = ("delay", "drop", "split", "merge", "duplicate", "corrupt", "silent", "vanish")
 DEVICE_FAULTS: dict[str, tuple[str, ...]] = {
-    "stage": ("alert", "interleave", "reset", "freeze", "wrong_status"),
+    "stage": ("alert", "reset", "freeze", "wrong_status"),
     "force": ("reset", "saturate", "freeze", "wrong_status"),
-    "displacement": ("alert", "interleave", "reset", "saturate", "freeze", "no_value", "wrong_status"),
+    "displacement": ("alert", "reset", "saturate", "freeze", "no_value", "wrong_status"),
     "hv": (
         "reset",
         "freeze",
@@ -41,8 +41,8 @@ class Fault(Table):
     ``kind`` is one of the wire's faults (delay, drop, split, merge, duplicate, corrupt, silent, vanish), which act
     on each message with ``probability``, or one of the instrument's own (`DEVICE_FAULTS`).
 
-    alert sends unsolicited lines every ``value`` seconds, interleave one before a reply, with ``probability``.
-    Otherwise ``value`` is: seconds for delay and split; amperes drawn beside the film for over_current; the part of
+    alert sends unsolicited lines every ``value`` seconds; with ``value = 0`` one between each command and its reply,
+    with ``probability``. Otherwise ``value`` is: seconds for delay and split; amperes drawn beside the film for over_current; the part of
     the voltage that is left for sag; the sign of the rail for saturate; the bit pattern for wrong_status of force
     and hv.
     """

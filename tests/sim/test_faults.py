@@ -135,8 +135,8 @@ def test_alerts_come_in_between(stage):
 
 def test_alerts_between_a_command_and_its_reply(make_host):
     host = make_host("stage", "displacement")
-    host.bench.inject(fault("stage", "interleave", duration_s=1.0))
-    host.bench.inject(fault("displacement", "interleave", probability=0.5))
+    host.bench.inject(fault("stage", "alert", value=0.0, duration_s=1.0))
+    host.bench.inject(fault("displacement", "alert", value=0.0, probability=0.5))
     assert host.ask("stage", POLL) == b"!01 1 IDLE WR\r\n" + REPLY
     pushed = [host.ask("displacement", b"M1\r").startswith(b"TG,1,") for _ in range(100)]
     assert 30 < sum(pushed) < 70
