@@ -42,9 +42,9 @@ class Fault(Table):
     on each message with ``probability``, or one of the instrument's own (`DEVICE_FAULTS`).
 
     alert sends unsolicited lines every ``value`` seconds; with ``value = 0`` one between each command and its reply,
-    with ``probability``. Otherwise ``value`` is: seconds for delay and split; amperes drawn beside the film for over_current; the part of
-    the voltage that is left for sag; the sign of the rail for saturate; the bit pattern for wrong_status of force
-    and hv.
+    with ``probability``. Otherwise ``value`` is: seconds for delay and split; amperes drawn beside the film for
+    over_current; the part of the voltage that is left for sag; the sign of the rail for saturate; the bit pattern for
+    wrong_status of force and hv.
     """
 
     role: Role
