@@ -54,6 +54,7 @@ class Row:
     worst_error: float  # relative
     beyond_tolerance: int
     faults: list[str]
+    missed_states: list[str]
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def save(report: Report, out_dir: Path) -> None:
     (out_dir / "extremes.json").write_text(text + "\n", encoding="utf-8")
     with (out_dir / "extremes.csv").open("w", encoding="utf-8", newline="") as file:
         counts = [status.name for status in Status]
-        plain = [key for key in rows[0] if key not in ("counts", "faults")]
+        plain = [key for key in rows[0] if key not in ("counts", "faults", "missed_states")]
         writer = csv.writer(file)
         writer.writerow([*plain, *counts, "faults"])
         for row in rows:
@@ -213,7 +214,7 @@ def _row(name: str, cases: list[Case]) -> Row:
     for wrinkling in ("plain", "tension_field"):
         found = _solve(cases, wrinkling, faults)
     if found is None:
-        return Row(name, len(cases), {}, 0, 0, 0, math.nan, math.nan, math.nan, 0, faults)
+        return Row(name, len(cases), {}, 0, 0, 0, math.nan, math.nan, math.nan, 0, faults, [])
     answered = found.status <= Status.WRINKLED
     truth = solve_reference(cases, "tension_field")
     both = answered & truth.converged
@@ -235,6 +236,7 @@ def _row(name: str, cases: list[Case]) -> Row:
         worst_error=float(error.max()) if both.any() else math.nan,
         beyond_tolerance=int((error > TOLERANCE + RESOLVED).sum()),
         faults=faults,
+        missed_states=[_describe(cases[i]) for i in np.flatnonzero(~answered & truth.converged)],
     )
 
 
@@ -291,7 +293,7 @@ def render(report: Report) -> RenderableType:
     table.add_column("family")
     for heading in ("states", *(s.name.lower().replace("_", " ") for s in Status), "checked", "missed"):
         table.add_column(heading, justify="right")
-    for heading in ("median ratio", "worst ratio", "worst error", "faults"):
+    for heading in ("median ratio", "worst ratio", "worst error", "> tolerance", "faults"):
         table.add_column(heading, justify="right")
     for row in report.rows:
         table.add_row(
@@ -303,6 +305,7 @@ def render(report: Report) -> RenderableType:
             f"{row.median_ratio:.1g}",
             f"{row.worst_ratio:.2g}",
             f"{row.worst_error:.0e}",
+            str(row.beyond_tolerance or ""),
             str(len(row.faults) or ""),
         )
     faults = report.faults

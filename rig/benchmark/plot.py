@@ -113,7 +113,7 @@ def speeds(report: Precision, path: Path) -> None:
     """Time per solve at an error of 1e-6, one bar a method and way of working."""
     rows = sorted(report.speeds, key=lambda speed: -speed.seconds)
     figure, axes = _figure(10.0, 1.1 + 0.34 * len(rows))
-    mode = {"cold single": ", one state", "sweep": ", curve of 50 points", "batch": " of 1000 states"}
+    alone = {"cold single": ", one state"}
     for i, speed in enumerate(rows):
         amount = 1e6 * speed.seconds
         axes.barh(i, amount, color=BLUE if speed.method.startswith("dea-rig") else "#bbbbbb")
@@ -121,7 +121,7 @@ def speeds(report: Precision, path: Path) -> None:
         if speed.error > 1e-6:
             text += f" (error {speed.error:.0e})"
         axes.text(amount * 1.1, i, text, va="center")
-    axes.set_yticks(range(len(rows)), [f"{speed.method}{mode[speed.mode]}" for speed in rows])
+    axes.set_yticks(range(len(rows)), [f"{speed.method}{alone.get(speed.mode, '')}" for speed in rows])
     known = [1e6 * speed.seconds for speed in rows]
     axes.set(xscale="log", xlabel="time per solve / µs (logarithmic)")
     axes.set_xlim(0.4 * min(known, default=1.0), 30 * max(known, default=1.0))
@@ -145,6 +145,7 @@ def extreme_states(report: Extremes, path: Path) -> None:
     """What became of the states of every family, and how the true error compares with the estimate."""
     rows = report.rows[::-1]
     figure, (left, right) = _figure(12.5, 1.6 + 0.42 * len(rows), 1, 2, sharey=True, width_ratios=(3, 2))
+    lowest = 1e-3
     for i, row in enumerate(rows):
         begin = 0.0
         for status, colour in STATUS_LOOK.items():
@@ -163,25 +164,27 @@ def extreme_states(report: Extremes, path: Path) -> None:
                 )
             begin += share
         if row.checked:
-            right.plot([max(row.median_ratio, 1e-6), max(row.worst_ratio, 1e-6)], [i, i], color=GREY, linewidth=1.5)
-            right.plot(max(row.median_ratio, 1e-6), i, "o", color=BLUE, label="median" if i == len(rows) - 1 else None)
-            right.plot(
-                max(row.worst_ratio, 1e-6), i, "D", color=VERMILLION, label="worst" if i == len(rows) - 1 else None
-            )
+            median, worst = max(row.median_ratio, lowest), max(row.worst_ratio, lowest)
+            first = i == len(rows) - 1
+            right.plot([median, worst], [i, i], color=GREY, linewidth=1.5, zorder=1)
+            right.plot(median, i, "o", color=BLUE, label="median (0.001 or less on the edge)" if first else None)
+            right.plot(worst, i, "D", color=VERMILLION, label="worst state" if first else None)
     left.set_yticks(range(len(rows)), [row.family for row in rows])
     left.set(xlabel="share of the states / % (numbers: states)", xlim=(0, 100))
-    left.set_title("What the solver says of each state", loc="left")
+    left.set_title("What the solver says of each state", loc="left", pad=14)
     handles, labels = left.get_legend_handles_labels()
-    wording = {"NOT_CONVERGED": "not converged"}
-    shown = [wording.get(label, label.lower()) for label in labels]
-    figure.legend(handles, shown, loc="outside lower left", ncols=len(labels), frameon=False)
+    seen = [k for k, status in enumerate(labels) if any(row.counts.get(status) for row in rows)]
+    wording = [labels[k].lower().replace("_", " ") for k in seen]
+    figure.legend([handles[k] for k in seen], wording, loc="outside lower left", ncols=len(seen), frameon=False)
     right.axvline(1.0, color=BLACK, linewidth=1)
     right.axvline(10.0, color=VERMILLION, linewidth=1, linestyle="--")
     right.text(1.0, len(rows) - 0.4, "as estimated ", ha="right", va="bottom", fontsize=8)
     right.text(10.0, len(rows) - 0.4, " limit: 10", ha="left", va="bottom", color=VERMILLION, fontsize=8)
     right.set(xscale="log", xlabel="true error / estimated error of the force", ylim=(-0.6, len(rows) + 0.2))
     right.set_title("Is the error estimate honest?", loc="left", pad=14)
-    right.legend(loc="lower left", frameon=False, fontsize=8)
+    figure.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2, frameon=False)
+    total, checked = sum(row.states for row in rows), sum(row.checked for row in rows)
+    figure.suptitle(f"The solver in {total} extreme states; {checked} answers judged by the reference formulation")
     _tidy(left)
     _tidy(right)
     left.grid(False, axis="y")
