@@ -475,7 +475,7 @@ def _take_picture(run: Run, recording: Path, target: Path, folder: Path) -> None
             with suppress(ConnectionError, RuntimeError):
                 client = client or ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
         client.set_time(TIMELINE, duration=_best_instant(run), play_state="paused")
-        clock.sleep_until(clock.now() + 5.0)  # for the views to settle and the viewer's own notices to vanish
+        clock.sleep_until(clock.now() + 1.0)  # for the views to settle and the viewer's own notices to vanish
         picture = folder / "picture.png"
         client.save_screenshot(str(picture))
         complaints = [report.summary for view in client.get_state().views for report in view.reports]
@@ -496,9 +496,11 @@ def _best_instant(run: Run) -> float:
     """When the film is farthest out, at the highest voltage at which that happens."""
     if not np.isfinite(run.h).any():
         return float(run.t[-1])
-    far = np.flatnonzero(run.h > 0.98 * np.nanmax(run.h))
+    far = np.flatnonzero(run.h >= 0.98 * np.nanmax(run.h))
+    if not far.size:  # all displacements are negative
+        far = np.array([np.nanargmax(run.h)])
     voltage = np.nan_to_num(run.voltage[far])
-    return float(run.t[far[np.flatnonzero(voltage > 0.98 * voltage.max())[0]]]) if far.size else float(run.t[-1])
+    return float(run.t[far[np.argmax(voltage >= 0.98 * voltage.max())]])
 
 
 @contextmanager
@@ -517,7 +519,7 @@ def _viewer(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
         "data_dir_path": str(settings / "analytics"),
     }
     (settings / "analytics.json").write_text(json.dumps(telemetry))
-    environment = {**os.environ, "XDG_CONFIG_HOME": str(folder), "XDG_DATA_HOME": str(folder)}
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(folder), "XDG_DATA_HOME": str(folder), "RUST_LOG": "error"}
     command = [str(binary), "--bind", "127.0.0.1", *arguments]
     with (folder / "messages.txt").open("wb") as messages:
         viewer = subprocess.Popen(command, env=environment, stdout=messages, stderr=messages, stdin=subprocess.DEVNULL)

@@ -70,6 +70,8 @@ def _copy(log: Log, container: ContainerWriter, report: list[str]) -> None:
             container.end_chunk()
             continue
         channel, sequence, log_ns, publish_ns, payload = message
+        if channel.topic not in log.topics:
+            continue
         if channel.topic not in channels:
             channels[channel.topic] = container.add_channel(channel.topic, channel.schema_name, channel.schema_data)
         container.add_message(channels[channel.topic], payload, log_ns, publish_ns, sequence)
@@ -84,6 +86,7 @@ def _copy(log: Log, container: ContainerWriter, report: list[str]) -> None:
 
 def _report(log: Log) -> list[str]:
     lines = [f"{sum(log.topics.values())} messages on {len(log.topics)} topics recovered."]
+    lines += [f"{topic}: {n} messages left out, they are not of this program" for topic, n in log.unknown.items()]
     if log.whole:
         return [*lines, "Nothing is missing."]
     lines += [f"bytes {gap.start} to {gap.end}: {gap.reason}" for gap in log.gaps]

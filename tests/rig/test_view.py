@@ -1,7 +1,9 @@
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -94,12 +96,16 @@ def test_without_hv_there_is_no_voltage(tmp_path):
         for k in range(10):
             fields = {"t_s": k / 10, "reading_mV_per_V": 0.0, "force_N": 0.1 * k, "flags": 0}
             writer.write("/force/sample", fields, k, k)
+            laser = {"t_s": k / 10, "reading_m": 0.0, "displacement_m": 1e-4 * k, "flags": 0}
+            writer.write("/displacement/sample", laser, k, k)
+        writer.attach("scene.toml", "application/toml", (SCENES / "no-hv.toml").read_bytes())
         writer.finish({})
     view(path, save=tmp_path / "run.rrd")
 
     from rerun.chunk import RrdReader
 
     entities = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "run.rrd")).stream()}
+    assert {"/film/surface", "/force", "/displacement"} <= entities
     assert not any("voltage" in entity for entity in entities)
 
 
@@ -168,6 +174,22 @@ def test_no_display_no_viewer(log, monkeypatch):
         view(log)
 
 
+@pytest.mark.parametrize("scene", [None, b"not = a scene"])
+def test_without_a_scene_there_is_no_film_but_the_rest(tmp_path, scene):
+    path = tmp_path / "bare.mcap"
+    with LogWriter(path) as writer:
+        if scene is not None:
+            writer.attach("scene.toml", "application/toml", scene)
+        writer.write("/force/sample", {"t_s": 0.5, "reading_mV_per_V": 0.0, "force_N": 0.1, "flags": 0}, 0, 0)
+        writer.finish({})
+    view(path, save=tmp_path / "run.rrd")
+
+    from rerun.chunk import RrdReader
+
+    entities = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "run.rrd")).stream()}
+    assert "/force" in entities and "/film/surface" not in entities
+
+
 def test_what_is_not_a_log_leaves_nothing(tmp_path):
     (tmp_path / "notes.txt").write_text("force was 3 N\n")
     with pytest.raises(LogError, match="is not a log"):
@@ -184,6 +206,22 @@ def test_a_place_that_cannot_be_written(log, tmp_path):
 def test_rerun_is_imported_only_when_a_log_is_viewed(module):
     code = f"import sys, {module}; sys.exit(any(name.split('.')[0].startswith('rerun') for name in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("h", "voltage", "when"),
+    [
+        ([0, 3, 3, 1, 3], [0, 0, 1e3, 1e3, 0], 2),
+        ([0, 3, 3, 1], [0, 0, 0, 0], 1),
+        ([0, math.nan, 3, 1], [0, math.nan, math.nan, 0], 2),
+        ([-3, -1, -2, -4], [0, 0, 0, 0], 1),
+        ([math.nan] * 4, [0] * 4, 3),
+    ],
+)
+def test_the_instant_of_the_picture(h, voltage, when):
+    """The farthest displacement, at the highest voltage that was on there."""
+    run = SimpleNamespace(t=np.arange(len(h)), h=np.array(h, dtype=float), voltage=np.array(voltage, dtype=float))
+    assert view_module._best_instant(run) == when
 
 
 @pytest.mark.parametrize(
