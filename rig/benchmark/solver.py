@@ -423,7 +423,7 @@ def _wrinkled(batch: int) -> dict[str, float]:
 
 def _ratios(speeds: Sequence[Speed], cells: Cells, wrinkled: dict[str, float]) -> list[Ratio]:
     """Medians over the states of the ratios of times on the same state, at the tolerances of ``speeds``."""
-    good = {s.method: s for s in speeds if s.mode != "sweep" and s.error <= WANTED}
+    good = {s.method: s for s in speeds if s.mode == "cold single" and s.error <= WANTED}
     ratios: list[Ratio] = []
 
     def faster(than: str) -> float:
@@ -438,7 +438,7 @@ def _ratios(speeds: Sequence[Speed], cells: Cells, wrinkled: dict[str, float]) -
         if shooting:
             best = min(shooting, key=lambda method: good[method].seconds)
             ratios.append(Ratio(f"cold single against {best}, the best shooting", faster(best), ">= 7"))
-        others = [method for method in good if method not in (OURS, BATCH)]
+        others = [method for method in good if method != OURS]
         if others:
             best = min(others, key=lambda method: good[method].seconds)
             ratios.append(Ratio(f"cold single against {best}, the best of all others", faster(best), "> 1"))
