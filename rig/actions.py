@@ -214,7 +214,7 @@ def _set_voltage(engine: Engine, action: Action) -> Turns:
         return (
             sample is not None
             and HVFlag.RAMPING not in sample.flags
-            and sample.setpoint == target
+            and math.isclose(sample.setpoint, target, rel_tol=1e-5, abs_tol=1e-3)  # it is single precision there
             and abs(sample.voltage - target) <= tolerance
         )
 
