@@ -67,7 +67,7 @@ class GSV8:
         self._status = 0
         self._noise = settings.noise_fraction * settings.sensitivity_mV_per_V
         self._mV_per_V_per_N = settings.sensitivity_mV_per_V * (1.0 + settings.gain_error) / settings.full_scale_N
-        self._frame: tuple[bytes, tuple[bytes, bytes]] | None = None
+        self._idle: tuple[bytes, bytes] | None = None
         self._frozen: float | None = None
         # Kept in non-volatile memory
         self._rate = settings.stored_rate_Hz
@@ -122,17 +122,16 @@ class GSV8:
         if self.saturated:
             reading = math.copysign(2 * top, self.saturated)
         raw = round((min(max(reading, -top), top) - self._zero[self._cell]) / top * 2**23)
-        head, tail = self._around()
         status = self._type << 4 | 0x80 | self._status | (abs(reading) > top)
-        return head + bytes([status]) + tail[0] + self._encode(raw, self._cell) + tail[1]
+        before, after = self._neighbours()
+        return bytes([0xAA, 0x10 | (CHANNELS - 1), status]) + before + self._encode(raw, self._cell) + after
 
-    def _around(self) -> tuple[bytes, tuple[bytes, bytes]]:
-        """What stands around the load cell's value in a frame: before the status byte, before and after the value."""
-        if self._frame is None:
+    def _neighbours(self) -> tuple[bytes, bytes]:
+        """What stands in a frame before and after the load cell's value: open inputs, and the end."""
+        if self._idle is None:
             idle = [self._encode(0, channel) for channel in range(CHANNELS)]
-            after = b"".join(idle[self._cell + 1 :]) + b"\x85"
-            self._frame = bytes([0xAA, 0x10 | (CHANNELS - 1)]), (b"".join(idle[: self._cell]), after)
-        return self._frame
+            self._idle = b"".join(idle[: self._cell]), b"".join(idle[self._cell + 1 :]) + b"\x85"
+        return self._idle
 
     def _encode(self, raw: int, channel: int) -> bytes:
         """A raw 24-bit number in the present value type."""
@@ -201,7 +200,7 @@ class GSV8:
         self._wire.send(bytes([0xAA, 0x50 | len(data), error]) + data + b"\x85", t + ANSWER_S)
 
     def _command(self, code: int, p: bytes, t: float) -> None:
-        self._frame = None  # it may look different from now on
+        self._idle = None  # scale, offset or type may change
         if code not in COMMANDS:
             return self._answer(UNKNOWN, b"", t)
         count = COMMANDS[code]

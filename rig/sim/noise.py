@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+BLOCK = 65_536  # drawn at once; a long silence must not ask for much memory
+
 
 class ConversionNoise:
     """Standard normal noise of a converter that works through conversions of equal length.
@@ -27,7 +29,8 @@ class ConversionNoise:
     def at(self, t: float) -> float:
         """The noise of the conversion that was complete at time ``t``."""
         due = math.floor((t - self._start) / self._period) + 1
-        if due > self._done:
-            self._value = float(self._rng.standard_normal(due - self._done)[-1])
-            self._done = due
+        while self._done < due:
+            count = min(due - self._done, BLOCK)
+            self._value = float(self._rng.standard_normal(count)[-1])
+            self._done += count
         return self._value
