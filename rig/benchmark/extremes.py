@@ -52,7 +52,8 @@ class Row:
     median_ratio: float  # true error of the force over its estimate
     worst_ratio: float
     worst_error: float  # relative
-    beyond_tolerance: int
+    beyond_tolerance: int  # states
+    beyond_three_estimates: int  # states
     faults: list[str]
     missed_states: list[str]
 
@@ -214,7 +215,7 @@ def _row(name: str, cases: list[Case]) -> Row:
     for wrinkling in ("plain", "tension_field"):
         found = _solve(cases, wrinkling, faults)
     if found is None:
-        return Row(name, len(cases), {}, 0, 0, 0, math.nan, math.nan, math.nan, 0, faults, [])
+        return Row(name, len(cases), {}, 0, 0, 0, math.nan, math.nan, math.nan, 0, 0, faults, [])
     answered = found.status <= Status.WRINKLED
     truth = solve_reference(cases, "tension_field")
     both = answered & truth.converged
@@ -235,6 +236,7 @@ def _row(name: str, cases: list[Case]) -> Row:
         worst_ratio=float(ratio.max()) if both.any() else math.nan,
         worst_error=float(error.max()) if both.any() else math.nan,
         beyond_tolerance=int((error > TOLERANCE + RESOLVED).sum()),
+        beyond_three_estimates=int((ratio > 3.0).sum()),
         faults=faults,
         missed_states=[_describe(cases[i]) for i in np.flatnonzero(~answered & truth.converged)],
     )
@@ -293,7 +295,7 @@ def render(report: Report) -> RenderableType:
     table.add_column("family")
     for heading in ("states", *(s.name.lower().replace("_", " ") for s in Status), "checked", "missed"):
         table.add_column(heading, justify="right")
-    for heading in ("median ratio", "worst ratio", "worst error", "> tolerance", "faults"):
+    for heading in ("median ratio", "worst ratio", "worst error", "> tolerance", "> 3 estimates", "faults"):
         table.add_column(heading, justify="right")
     for row in report.rows:
         table.add_row(
@@ -306,6 +308,7 @@ def render(report: Report) -> RenderableType:
             f"{row.worst_ratio:.2g}",
             f"{row.worst_error:.0e}",
             str(row.beyond_tolerance or ""),
+            str(row.beyond_three_estimates or ""),
             str(len(row.faults) or ""),
         )
     faults = report.faults

@@ -181,6 +181,7 @@ def extreme_states(report: Extremes, path: Path) -> None:
     right.text(1.0, len(rows) - 0.4, "as estimated ", ha="right", va="bottom", fontsize=8)
     right.text(10.0, len(rows) - 0.4, " limit: 10", ha="left", va="bottom", color=VERMILLION, fontsize=8)
     right.set(xscale="log", xlabel="true error / estimated error of the force", ylim=(-0.6, len(rows) + 0.2))
+    right.set_xlim(0.6 * lowest, max(60.0, 2 * right.get_xlim()[1]))
     right.set_title("Is the error estimate honest?", loc="left", pad=14)
     figure.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2, frameon=False)
     total, checked = sum(row.states for row in rows), sum(row.checked for row in rows)
