@@ -22,6 +22,7 @@ MOST_STEPS = 25
 NEWTON_FACTOR = 0.3
 RUNG_FACTOR = 0.5
 ROUND_OFF = 1e-13
+LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two rungs may agree by chance
 
 
 @dataclass(slots=True)
@@ -32,6 +33,7 @@ class Iterate:
     state: State
     lam: Array
     change: Array  # largest relative change of a slope in the last step
+    tail: Array  # share of the energy that the last modes carry
     stable: NDArray[np.bool_]
     ok: NDArray[np.bool_]
     steps: NDArray[np.intp]
@@ -71,6 +73,15 @@ def advance(state: State, step: ritz.Step, at: ritz.Points, grid: Grid) -> tuple
     return State(c, moved, natural, state.relaxed), change
 
 
+def tail(problem: Problem, grid: Grid, state: State, step: ritz.Step) -> Array:
+    """Energy of the last mode of every element and a tenth of that of the last but one, over ``F h``."""
+    modes, m = grid.table.modes, grid.elements
+    last = state.c[modes - 1 : m * modes : modes] ** 2 * step.diagonal[modes - 1 : m * modes : modes]
+    fore = state.c[modes - 2 : m * modes : modes] ** 2 * step.diagonal[modes - 2 : m * modes : modes]
+    energy: Array = (last + 0.1 * fore).sum(axis=0)
+    return 0.5 * energy / (step.lam * problem.height)
+
+
 def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int = MOST_STEPS) -> Iterate:
     """Newton from ``state`` until the slopes change by less than ``goal`` (relative); the error is then its square."""
     states = state.w.shape[2]
@@ -91,13 +102,14 @@ def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
             break
         if n >= 4 and states > 1 and done.mean() > 0.5:
             rest = np.flatnonzero(~done)
+            ends = tail(problem, grid, state, step)
             more = newton(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n)
             state.put(rest, more.state)
-            lam[rest], change[rest], stable[rest] = more.lam, more.change, more.stable
+            lam[rest], change[rest], stable[rest], ends[rest] = more.lam, more.change, more.stable, more.tail
             steps[rest] += more.steps
-            done = change <= goal
-            break
-    return Iterate(grid, state, lam, change, stable, done & stable & (lam > 0.0), steps)
+            return Iterate(grid, state, lam, change, ends, stable, (change <= goal) & stable & (lam > 0.0), steps)
+    ends = tail(problem, grid, state, step)
+    return Iterate(grid, state, lam, change, ends, stable, done & stable & (lam > 0.0), steps)
 
 
 @dataclass(slots=True)
@@ -188,7 +200,9 @@ def climb(
         lam, ok = result.lam, result.ok
         modes = start.grid.table.modes
         if previous is not None:
-            error = RUNG_FACTOR * np.abs(lam - previous) / np.abs(lam) + NEWTON_FACTOR * result.change**2 + ROUND_OFF
+            error = RUNG_FACTOR * np.abs(lam - previous) / np.abs(lam) + NEWTON_FACTOR * result.change**2
+            error += result.tail
+            error += ROUND_OFF + LEAST_SHARE * tolerance
             settled = np.flatnonzero(ok & (error <= tolerance))
             if len(settled):
                 part = (problem, start, lam)

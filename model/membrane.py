@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Literal
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from model import ritz, tension_field, trace
 from model.ladder import Answer, Start, climb, first_modes
 from model.law import Array, Evaluations, Film, stack, stress
-from model.ritz import Grid, Problem
+from model.ritz import LONGEST, Grid, Problem
 from model.specimen import Specimen
 
 Wrinkling = Literal["plain", "tension_field"]
@@ -22,6 +22,7 @@ BLOCK = 512  # states solved together: their arrays stay in the processor's cach
 # Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
 # followed from rest.
 SOFTENING = 0.25
+TRACE_MODES = 10
 FLAT = -1e-13  # of G: a hoop stress that is zero in the exact solution may come out as round-off
 
 
@@ -168,6 +169,22 @@ class _Inputs:
         which, hh, vv = np.broadcast_arrays(index, h_array, v_array)
         return cls(hh.shape, specimens, which.ravel(), hh.ravel(), vv.ravel())
 
+    def blocks(self) -> Iterator[NDArray[np.intp]]:
+        """States to solve together: with or without voltage, of like spans, and as many as stay in the cache."""
+        index = np.flatnonzero(np.isfinite(self.h) & np.isfinite(self.voltage))
+        charged = self.voltage[index] != 0.0
+        groups = [index] if charged.all() or not charged.any() else [index[~charged], index[charged]]
+        for group in groups:
+            spans = np.array([math.log(s.ring_radius / s.disk_radius) for s in self.specimens])[self.which[group]]
+            if len(self.specimens) > 1:
+                order = np.argsort(spans, kind="stable")
+                group, spans = group[order], spans[order]
+            pieces = np.ceil(spans / LONGEST)
+            cuts = np.flatnonzero(np.diff(pieces)) + 1
+            for part in np.split(group, cuts):
+                for start in range(0, len(part), BLOCK):
+                    yield part[start : start + BLOCK]
+
 
 def _padded(materials: Sequence[tuple[float, ...]], fill: float) -> Array:
     terms = max(len(values) for values in materials)
@@ -205,8 +222,8 @@ def solve_many(
     result = _Flat(len(inputs.h), max((len(s.material.mu) for s in inputs.specimens), default=1), sensitivities)
     count = Evaluations()
     with np.errstate(all="ignore"):
-        for start in range(0, len(inputs.h), BLOCK):
-            _Block(inputs, slice(start, start + BLOCK), count).solve(result, tolerance, wrinkling, sensitivities)
+        for index in inputs.blocks():
+            _Block(inputs, index, count).solve(result, tolerance, wrinkling, sensitivities)
     return result.solutions(inputs.shape, count)
 
 
@@ -289,12 +306,10 @@ class _Flat:
 class _Block:
     """Some of the states, in dimensionless form, and the way back to SI."""
 
-    def __init__(self, inputs: _Inputs, part: slice, count: Evaluations) -> None:
-        which, h, v = inputs.which[part], inputs.h[part], inputs.voltage[part]
-        valid = np.isfinite(h) & np.isfinite(v)
-        self.index = np.arange(part.start, part.start + len(h))[valid]
-        self.h, self.voltage = h[valid], v[valid]
-        used, pick = np.unique(which[valid], return_inverse=True)
+    def __init__(self, inputs: _Inputs, index: NDArray[np.intp], count: Evaluations) -> None:
+        self.index = index
+        self.h, self.voltage = inputs.h[index], inputs.voltage[index]
+        used, pick = np.unique(inputs.which[index], return_inverse=True)
         films = [inputs.specimens[i] for i in used]
         self.terms = np.array([len(s.material.mu) for s in films], dtype=np.intp)[pick]
         numbers = np.array(
@@ -331,8 +346,6 @@ class _Block:
 
     def solve(self, result: _Flat, tolerance: float, wrinkling: Wrinkling, sensitivities: bool) -> None:
         """Solve the block and write what comes out."""
-        if len(self.index) == 0:
-            return
         index, problem = np.arange(len(self.index)), self.problem
         if problem.film.field is not None:
             slack = self.slack()
@@ -343,7 +356,8 @@ class _Block:
                     return
                 problem = problem.take(index)
         relaxed = wrinkling == "tension_field"
-        grid = Grid.lay(first_modes(float(problem.span.max()), tolerance), problem.whole())
+        breaks = problem.cut()
+        grid = Grid.lay(first_modes(float(problem.span.max()) / (len(breaks) - 1), tolerance), breaks)
         start = Start(grid, ritz.guess(problem, grid))
         answers, lost, steps = climb(problem, tolerance, start, sensitivities=sensitivities)
         doubtful = [lost]
@@ -385,7 +399,7 @@ class _Block:
     ) -> None:
         """Solve states for which a cold start may have missed, or jumped from, the branch that starts at rest."""
         part = problem.take(some)
-        path = trace.follow(part, max(10, first_modes(float(part.span.max()), 1e-6)), relaxed=relaxed)
+        path = trace.follow(part, TRACE_MODES, relaxed=relaxed)
         steps[some] += path.steps
         status = np.where(path.limit, Status.UNSTABLE, Status.NOT_CONVERGED)
         result.status[self.index[index[some]]] = status

@@ -22,6 +22,7 @@ Arrays at points have the shape (Q, M, S): points of an element, elements, state
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -223,9 +224,21 @@ class Problem:
     def take(self, index: Index) -> Problem:
         return Problem(self.film.take(index), self.log_prestretch[index], self.span[index], self.height[index])
 
-    def whole(self) -> Array:
-        """The breaks of one element over the whole film."""
-        return np.stack((-self.span, np.zeros_like(self.span)))
+    def cut(self, pieces: int | None = None) -> Array:
+        """Breaks (M+1, S) of equal elements over the film: as many as the longest span asks for, or ``pieces``."""
+        if pieces is None:
+            pieces = elements(self.span)
+        return -self.span * np.linspace(1.0, 0.0, pieces + 1)[:, None]
+
+
+# Radii of an element differ by less than e^4 = 55. Over more the weights R^2 cost digits, and modes of a high degree
+# are wasted on the far end.
+LONGEST = 4.0
+
+
+def elements(span: Array) -> int:
+    """Elements for films of these spans."""
+    return max(1, math.ceil(float(span.max()) / LONGEST))
 
 
 @dataclass(slots=True)
@@ -301,6 +314,7 @@ class Step:
     dw: Array  # (Q, M, S)
     lam: Array  # (S,)
     stable: NDArray[np.bool_]
+    diagonal: Array  # (n, S) of the reduced matrix
     tangent: tuple[Array, Array, Array] | None = None  # dc/dh, dw/dh, dlam/dh
 
 
@@ -419,7 +433,8 @@ def newton(problem: Problem, grid: Grid, state: State, at: Points, *, tangent: b
 
     dc = solutions[0]
     lam = system.lam0 + (system.coupling * dc).sum(axis=0) / system.give
-    step = Step(dc, slopes(dc, lam, system.gw), lam, positive & system.positive)
+    diagonal = np.einsum("iis->is", system.matrix)
+    step = Step(dc, slopes(dc, lam, system.gw), lam, positive & system.positive, diagonal)
     if tangent:
         tc = solutions[1]
         stiffness = (1.0 + (system.coupling * tc).sum(axis=0)) / system.give
@@ -443,3 +458,37 @@ def guess(problem: Problem, grid: Grid) -> State:
     w = np.exp(np.log(grid.radius) / -power)
     w *= problem.height / (grid.once * w).sum(axis=(0, 1))
     return State(np.zeros((grid.unknowns, w.shape[2])), w)
+
+
+def careful_guess(problem: Problem, grid: Grid) -> State:
+    """The first state with r = R held exactly: for films whose slopes follow no power law, at many times the cost.
+
+    Each point's balance ``R sigma1 w/(1+w^2) = lam`` is solved for ln(w), and lam for the height.
+    """
+    state = guess(problem, grid)
+    log_w = np.log(np.minimum(state.w, 1.0))
+    log_lam = np.full(len(problem.span), np.nan)
+    for outer in range(40):
+        for _ in range(30 if outer == 0 else 6):
+            w = np.exp(log_w)
+            part = w * w / (1.0 + w * w)
+            log1 = 0.5 * np.log1p(w * w) + problem.log_prestretch
+            law = stress(problem.film, stack(log1, np.broadcast_to(problem.log_prestretch, log1.shape)))
+            pull = np.log(np.maximum(law.t1, 1e-300)) + np.log(grid.radius * w / (1.0 + w * w))
+            power = np.maximum(1.0 - 2.0 * part + part * law.h11 / law.t1, 0.2)
+            if outer == 0 and not np.isfinite(log_lam).all():
+                log_lam = np.median(pull.reshape(-1, pull.shape[2]), axis=0)
+            step = (log_lam - pull) / power
+            log_w = log_w + np.clip(step, -0.7, 0.7)
+            if not np.abs(step).max() > 1e-6:
+                break
+        w = np.exp(log_w)
+        reach = (grid.once * w).sum(axis=(0, 1))
+        give = (grid.once * w / power).sum(axis=(0, 1)) / reach
+        miss = np.log(problem.height / reach)
+        log_lam = log_lam + np.clip(miss / give, -2.0, 2.0)
+        if not np.abs(miss).max() > 1e-3:
+            break
+    w *= problem.height / (grid.once * w).sum(axis=(0, 1))
+    good = np.isfinite(w).all(axis=(0, 1))
+    return State(state.c, np.where(good, w, state.w))

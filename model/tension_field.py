@@ -11,6 +11,7 @@ of its distance only, and each step leaves a distance of the square of the last.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,9 +86,9 @@ def search(problem: Problem, grid: Grid, state: State, goal: float = 3e-3, limit
             lam[rest], change[rest], stable[rest] = more.lam, more.change, more.stable
             quiet[rest] = more.ok
             steps[rest] += more.steps
-            return Iterate(grid, state, lam, change, stable, quiet & stable & (lam > 0.0), steps)
+            return Iterate(grid, state, lam, change, np.zeros(states), stable, quiet & stable & (lam > 0.0), steps)
     stable = step.stable & at.law.relief.regular.all(axis=(0, 1))
-    return Iterate(grid, state, step.lam, change, stable, quiet & stable & (step.lam > 0.0), steps)
+    return Iterate(grid, state, step.lam, change, np.zeros(states), stable, quiet & stable & (step.lam > 0.0), steps)
 
 
 @dataclass(slots=True)
@@ -113,8 +114,7 @@ def zones(grid: Grid, state: State, at: Points, slack: float = 0.0) -> Zones:
         half = 0.5 * (grid.breaks[1:] - grid.breaks[:-1])
         x = (grid.breaks[:-1] + half)[:, None] + half[:, None] * xi[:, None]
     else:  # each point decides for itself: no polynomial passes through them
-        fine = tension[:, 0][None]
-        x = np.log(grid.radius[:, 0])[None]
+        fine, x = tension.swapaxes(0, 1), np.log(grid.radius).swapaxes(0, 1)
     fine, x = fine.reshape(-1, fine.shape[2]), x.reshape(-1, x.shape[2])
     folded = fine < 0.0
     if slack > 0.0 and whole and state.relaxed is not None:
@@ -187,6 +187,8 @@ def settle(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
             breaks = grid.breaks.copy()
             length = grid.breaks[1:] - grid.breaks[:-1]
             for cut in range(1, m):
+                if kinds[cut - 1] == kinds[cut]:
+                    continue
                 taut, end, side = (cut, 0, 1.0) if kinds[cut - 1] else (cut - 1, 1, -1.0)
                 value = t.ends[end] @ tension[:, taut]
                 slope = (t.end_slopes[end] @ tension[:, taut]) * grid.dxi[taut] * side
@@ -210,12 +212,26 @@ def settle(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
             lam = step.lam
             lam[rest], change[rest], stable[rest] = more.lam, more.change, more.stable
             steps[rest] += more.steps
+            ends = ladder.tail(problem, grid, state, step)
+            ends[rest] = more.tail
             breaks = grid.breaks.copy()
             breaks[:, rest] = more.grid.breaks
             grid = Grid.lay(t.modes, breaks)
             done = change <= goal
-            return Iterate(grid, state, lam, change, stable, done & stable & (lam > 0.0), steps)
-    return Iterate(grid, state, step.lam, change, stable, done & stable & (step.lam > 0.0), steps)
+            return Iterate(grid, state, lam, change, ends, stable, done & stable & (lam > 0.0), steps)
+    ends = ladder.tail(problem, grid, state, step)
+    return Iterate(grid, state, step.lam, change, ends, stable, done & stable & (step.lam > 0.0), steps)
+
+
+def _cut(film: Problem, edges: Array, first: bool) -> tuple[Array, NDArray[np.bool_]]:
+    """Breaks at the zones' ``edges`` and inside zones that are too long, and which elements are wrinkled."""
+    ends = np.concatenate((-film.span[None], edges, np.zeros((1, len(film.span)))))
+    breaks, wrinkled = [ends[:1]], []
+    for number, (left, right) in enumerate(pairwise(ends)):
+        pieces = ritz.elements(right - left)
+        breaks.append(left + (right - left) * np.linspace(0.0, 1.0, pieces + 1)[1:, None])
+        wrinkled += [(number % 2 == 0) == first] * pieces
+    return np.concatenate(breaks), np.array(wrinkled)
 
 
 def admissible(grid: Grid, state: State) -> NDArray[np.bool_]:
@@ -239,7 +255,7 @@ def solve(
     index = np.arange(len(problem.span))
     steps = np.zeros(len(index), dtype=np.intp)
     if begin is None:
-        grid = Grid.lay(START_MODES, problem.whole())
+        grid = Grid.lay(START_MODES, problem.cut())
         found = search(problem, grid, guess(problem, grid))
         steps += found.steps
         start, good = Start(grid, found.state), found.ok
@@ -286,9 +302,8 @@ def _round(
                 lost.append(index[some[of]])
                 continue
             film = part.take(of)
-            wrinkled = (np.arange(changes + 1) % 2 == 0) == first
-            breaks = np.concatenate((film.whole()[:1], zone.where[:changes, of], film.whole()[1:]))
-            modes = ladder.first_modes(0.7 * float(film.span.max()), tolerance)
+            breaks, wrinkled = _cut(film, zone.where[:changes, of], first)
+            modes = ladder.first_modes(0.7 * float((breaks[1:] - breaks[:-1]).max()), tolerance)
             begun = remap(film, Start(grid.take(of), chosen.take(of)), breaks, modes, wrinkled)
             done, missed, spent = ladder.climb(film, tolerance, begun, sensitivities=sensitivities, settle=settle)
             where = index[some[of]]

@@ -55,11 +55,11 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
     """Follow every state along its path, in steps that each state chooses by itself."""
     states = len(problem.span)
     everyone = np.arange(states)
-    grid = Grid.lay(modes, problem.whole())
+    grid = Grid.lay(modes, problem.cut())
     correct: Callable[[Problem, Grid, State, float, int], Iterate] = tension_field.search if relaxed else ladder.newton
 
     def first(part: Problem, laid: Grid) -> State:
-        return tension_field.guess(part, laid) if relaxed else ritz.guess(part, laid)
+        return tension_field.guess(part, laid) if relaxed else ritz.careful_guess(part, laid)
 
     # Most states are found at once at their height without voltage; the others begin low.
     progress = np.ones(states)

@@ -37,10 +37,10 @@ def solve_cases(cases: Any) -> list[dict[str, Any]]:
     """Solve a list of cases; the answers stand in the same order.
 
     A case is an object with, in SI units, ``id, a, b, thickness, prestretch, h, voltage, wrinkling`` ("plain" or
-    "tension_field"), ``material {mu: [...], alpha: [...], eps_r}`` and optionally ``tolerance`` (relative, of the force);
-    ``voltage`` 0, ``wrinkling`` "plain" and ``tolerance`` 1e-8 when left out. An answer has ``id, status, F,
-    error_estimate, peak_field, min_hoop_stress, max_stretch, iterations``, the numbers None when there is no answer, and
-    then a ``message``. A bad case gets the status "invalid" and does not touch its neighbours.
+    "tension_field"), ``material {mu: [...], alpha: [...], eps_r}`` and optionally ``tolerance`` (relative, of the
+    force); ``voltage`` 0, ``wrinkling`` "plain" and ``tolerance`` 1e-8 when left out. An answer has ``id, status, F,
+    error_estimate, peak_field, min_hoop_stress, max_stretch, iterations``, the numbers None when there is no answer,
+    and then a ``message``. A bad case gets the status "invalid" and does not touch its neighbours.
 
     Raises
     ------
