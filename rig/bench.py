@@ -123,6 +123,7 @@ class Bench:
         from rig.sim.wire import FrameWire
 
         simulated = simulated_bench(self.scene)
+        simulated.prepare()
         clock = VirtualClock(simulated.advance)
         for role in self.scene.instruments:
             wire = simulated.wire(role)

@@ -122,9 +122,7 @@ def sim(scene: Path) -> None:
     from rig.sim.server import Server
 
     loaded, _ = load_scene(scene)
-    bench = simulated_bench(loaded)
-    bench.world.film  # noqa: B018  # its table takes a while to make; afterwards nothing may make the bench late
-    server = Server(bench, RealClock())
+    server = Server(simulated_bench(loaded), RealClock())
     with stop_on_signals() as stop:
         try:
             click.echo(json.dumps(server.ports))

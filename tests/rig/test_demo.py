@@ -68,6 +68,7 @@ def test_one_seed_gives_one_log(demo: tuple[Path, Result], tmp_path: Path) -> No
         assert {k: a.data for k, a in first.attachments.items()} == {k: a.data for k, a in second.attachments.items()}
 
 
+@pytest.mark.slow
 def test_another_seed_gives_another_log(demo: tuple[Path, Result], tmp_path: Path) -> None:
     out = tmp_path / "other"
     CliRunner().invoke(main, ["demo", "--out", str(out), "--seed", "2"], catch_exceptions=False)
