@@ -290,10 +290,10 @@ def render(report: Report) -> RenderableType:
     table = Table(
         title=f"Extreme states, tension field, tolerance {report.tolerance:.0e}",
         caption="Ratios: true error of the force over its estimate, judged by the reference formulation. "
-        "Missed: the reference has an answer and the solver none.",
+        "Missed: the reference has an answer and the solver none; unverified: the opposite.",
     )
     table.add_column("family")
-    for heading in ("states", *(s.name.lower().replace("_", " ") for s in Status), "checked", "missed"):
+    for heading in ("states", *(s.name.lower().replace("_", " ") for s in Status), "checked", "unverified", "missed"):
         table.add_column(heading, justify="right")
     for heading in ("median ratio", "worst ratio", "worst error", "> tolerance", "> 3 estimates", "faults"):
         table.add_column(heading, justify="right")
@@ -303,6 +303,7 @@ def render(report: Report) -> RenderableType:
             str(row.states),
             *(str(row.counts.get(status.name, "")) for status in Status),
             str(row.checked),
+            str(row.unverified or ""),
             str(row.missed or ""),
             f"{row.median_ratio:.1g}",
             f"{row.worst_ratio:.2g}",
