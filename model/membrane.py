@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, Literal
 
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from model import ritz, tension_field, trace
 from model.ladder import Answer, Start, climb, first_modes
 from model.law import Array, Evaluations, Film, stack, stress
+from model.profile import Profile, profile
 from model.ritz import LONGEST, Grid, Problem
 from model.specimen import Specimen
 
@@ -128,7 +129,7 @@ class Solution:
     stretch_exceeded: bool
     dforce: dict[str, Any] | None = None
     evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
-    state: tuple[Array, Array] | None = field(default=None, repr=False, compare=False)
+    kept: tuple[Problem, Answer] | None = field(default=None, repr=False, compare=False)
 
     @property
     def answered(self) -> bool:
@@ -139,6 +140,30 @@ class Solution:
     def tension_margin(self) -> float:
         """The smaller of the two least stresses (Pa): negative when tension is lost."""
         return min(self.min_hoop_stress, self.min_meridional_stress)
+
+    def profile(self, points: int = 101) -> Profile:
+        """Shape, stretches, stresses and field from disk to ring, at ``points`` radii an element.
+
+        Raises
+        ------
+        ValueError : the state has no answer
+        """
+        if self.kept is None:
+            raise ValueError(f"no profile: {self.status.message}")
+        problem, answer = self.kept
+        s = self.specimen
+        found = profile(
+            problem,
+            answer.grid,
+            answer.state,
+            answer.lam,
+            points,
+            ring=s.ring_radius,
+            shear=s.material.shear_modulus,
+            field=abs(self.voltage) / s.thickness,
+        )
+        sign = -1.0 if self.h < 0.0 else 1.0
+        return replace(found, z=sign * found.z, slope=sign * found.slope)
 
 
 @dataclass
@@ -214,17 +239,23 @@ def solve_many(
     -------
     Solutions of shape S. A state without an answer has a status that says so and NaN; it never raises.
     """
+    return _solve(_Inputs.gather(specimen, h, voltage), tolerance, wrinkling, sensitivities)[0]
+
+
+def _solve(
+    inputs: _Inputs, tolerance: float, wrinkling: Wrinkling, sensitivities: bool
+) -> tuple[Solutions, tuple[Problem, Answer] | None]:
+    """The solutions, and the last answer with its problem."""
     if not 1e-12 <= tolerance <= 1e-2:
         raise ValueError(f"tolerance = {tolerance!r}: allowed are 1e-12 to 1e-2")
     if wrinkling not in ("plain", "tension_field"):
         raise ValueError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
-    inputs = _Inputs.gather(specimen, h, voltage)
     result = _Flat(len(inputs.h), max((len(s.material.mu) for s in inputs.specimens), default=1), sensitivities)
     count = Evaluations()
     with np.errstate(all="ignore"):
         for index in inputs.blocks():
             _Block(inputs, index, count).solve(result, tolerance, wrinkling, sensitivities)
-    return result.solutions(inputs.shape, count)
+    return result.solutions(inputs.shape, count), result.kept
 
 
 def solve(
@@ -237,9 +268,7 @@ def solve(
     sensitivities: bool = False,
 ) -> Solution:
     """Solve one state: `solve_many` for scalars, with the profiles at hand."""
-    many = solve_many(
-        specimen, float(h), float(voltage), tolerance=tolerance, wrinkling=wrinkling, sensitivities=sensitivities
-    )
+    many, kept = _solve(_Inputs.gather(specimen, float(h), float(voltage)), tolerance, wrinkling, sensitivities)
     return Solution(
         specimen=specimen,
         h=float(h),
@@ -261,6 +290,7 @@ def solve(
         if many.dforce is None
         else {k: v if k in ("mu", "alpha") else float(v) for k, v in many.dforce.items()},
         evaluations=many.evaluations,
+        kept=kept,
     )
 
 
@@ -286,6 +316,7 @@ class _Flat:
         }
         self.status = np.full(states, Status.INVALID, dtype=np.int8)
         self.dforce: dict[str, Array] | None = None
+        self.kept: tuple[Problem, Answer] | None = None
         if sensitivities:
             names = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
             self.dforce = {name: np.full(states, np.nan) for name in names}
@@ -431,6 +462,7 @@ class _Block:
                 return
             answer = answer.take(these)
         where = index[answer.index]
+        result.kept = (self.problem.take(where), answer)
         to = self.index[where]
         h, v, t, shear, lp, b = (x[where] for x in (self.h, self.voltage, self.t, self.shear, self.lp, self.b))
         sign = np.sign(h)

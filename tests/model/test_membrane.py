@@ -12,7 +12,7 @@ import pytest
 import scipy.constants
 
 from model.materials import EPSILON_0, NAMED, Material
-from model.membrane import Status, solve, solve_many
+from model.membrane import Status, Wrinkling, solve, solve_many
 from model.specimen import Specimen
 
 PARKER = NAMED["parker-cao2018"]
@@ -259,3 +259,37 @@ def test_impossible_specimens_are_refused(bad: dict[str, float]) -> None:
 def test_impossible_materials_are_refused(bad: dict[str, object], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         replace(PARKER, **bad)
+
+
+@pytest.mark.parametrize(
+    ("specimen", "h", "v", "wrinkling"),
+    [
+        (film(), 10e-3, 1500.0, "plain"),
+        (film(4, 1.0), -12e-3, 1900.0, "tension_field"),
+        (film(4, 1.0), 12e-3, 1300.0, "tension_field"),
+        (film(8, 1.3, NAMED["treloar-ogden1972"]), 40e-3, 0.0, "plain"),
+    ],
+)
+def test_profile_obeys_the_equations(specimen: Specimen, h: float, v: float, wrinkling: Wrinkling) -> None:
+    """Edges, vertical balance at every radius, strain from the shape, and the extremes that the solution states."""
+    answer = solve(specimen, h, v, tolerance=1e-12, wrinkling=wrinkling)
+    p = answer.profile(201)
+    lp, t = specimen.prestretch, specimen.thickness
+    assert np.all(np.diff(p.R) > 0.0)
+    np.testing.assert_allclose(p.r[[0, -1]], [specimen.disk_radius, specimen.ring_radius], rtol=1e-12)
+    np.testing.assert_allclose(p.z[[0, -1]], [h, 0.0], rtol=1e-10, atol=1e-15)
+    force = 2.0 * np.pi * p.R * t / lp * p.stress_1 / p.stretch_1 * np.sin(p.slope)
+    np.testing.assert_allclose(force, answer.force, rtol=2e-6)
+    np.testing.assert_allclose(p.stretch_2[~p.wrinkled], (lp * p.r / p.R)[~p.wrinkled], rtol=1e-9)
+    length = np.hypot(np.gradient(p.r, p.R, edge_order=2), np.gradient(p.z, p.R, edge_order=2))
+    inside = ~np.isin(np.arange(len(p.R)), np.flatnonzero(np.diff(p.wrinkled.astype(int)))[:, None] + [-1, 0, 1, 2])
+    np.testing.assert_allclose((lp * length)[inside], p.stretch_1[inside], rtol=3e-3)
+    assert p.field.max() == pytest.approx(answer.peak_field, rel=1e-4, abs=1e-300)
+    assert p.stress_1.min() == pytest.approx(answer.min_meridional_stress, rel=1e-4)
+    assert p.stress_2.min() == pytest.approx(answer.min_hoop_stress, rel=1e-3, abs=1e-6 * p.stress_1.max())
+    assert p.wrinkled.any() == (wrinkling == "tension_field")
+
+
+def test_no_profile_without_an_answer() -> None:
+    with pytest.raises(ValueError, match="slack"):
+        solve(film(4, 1.0), 1e-3, 2500.0).profile()
