@@ -23,16 +23,18 @@ from numpy.typing import NDArray
 from scipy.special import gammaincc
 
 from calibration.curve import Curve
+from calibration.identifiability import advice
 from calibration.problem import TOLERANCE, IdentificationError, Problem
+from calibration.profile import intervals, targets, widened
 from calibration.propagation import secant_modulus, state
 from calibration.reduction import interpolation_matrix, select
-from calibration.result import CurveResult, Identification, Quantity
+from calibration.result import CurveResult, Identification
 from model.materials import Material
 from model.membrane import solve_many
 
 Array = NDArray[np.float64]
 
-__all__ = ["IdentificationError", "compare", "expected_uncertainties", "identify", "secant_modulus"]
+__all__ = ["IdentificationError", "compare", "identify", "secant_modulus"]
 
 PASSES = 5
 SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
@@ -51,6 +53,7 @@ def identify(
     starts: int = 6,
     seed: int = 0,
     negative_exponents: bool = False,
+    profiles: bool = False,
     fixed: Mapping[str, float] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Identification:
@@ -66,6 +69,9 @@ def identify(
         Starting points; the first is the material of the specimens, the others are drawn with ``seed``.
     negative_exponents : bool
         Let every third starting point have ``alpha_1 < 0`` (and ``mu_1 < 0``). A sign never changes during a fit.
+    profiles : bool
+        Also find the 95 % intervals of ``G``, ``stiffness`` and ``eps_r`` by profile likelihood. It takes a few times
+        as long, and widens the uncertainties where the problem is too far from linear for its curvature to tell.
     fixed : mapping of str to float, optional
         ``alpha1``... and ``eps_r`` that are known and not to be fitted, e.g. ``{"eps_r": 1.7}``.
     provenance : mapping, optional
@@ -121,22 +127,12 @@ def identify(
         "settings": {"terms": terms, "starts": starts, "seed": seed, "fixed": held},
         "software": {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")},
     }
-    return _assemble(best, fits, held, notes, record)
+    return _assemble(best, fits, held, notes, record, profiles=profiles)
 
 
 def compare(curves: Sequence[Curve], *, terms: Sequence[int] = (1, 2, 3), **options: Any) -> list[Identification]:
     """`identify` with each number of Ogden terms, to be compared by ``aicc`` and ``bic``; ``options`` as there."""
     return [identify(curves, terms=count, **options) for count in terms]
-
-
-def expected_uncertainties(curves: Sequence[Curve], material: Material) -> dict[str, Quantity]:
-    """What `identify` would state if ``material`` were the truth and the curves' noise were as they say.
-
-    Only the displacements, voltages and uncertainties of ``curves`` matter, not their forces: this is for planning.
-    """
-    problem = Problem(curves, select(curves, material), len(material.mu), material, trust_noise=True)
-    x = problem.vector(material)
-    return state(problem, x, np.zeros(x.size, dtype=np.bool_), held={}).quantities
 
 
 # --- starting points and minimisation
@@ -198,18 +194,14 @@ class _Fit:
     evaluations: int
     varied: NDArray[np.bool_]
     at_bound: NDArray[np.bool_]
-    covariance: Array | None  # lmfit's own, of the varied parameters
 
     def restarted(self, problem: Problem) -> Array:
         """This minimum as a starting point of ``problem``, whose scale and set of zeros may differ."""
         x = problem.vector(self.problem.film(self.x))
-        zeros = {zero[:2]: value for zero, value in zip(self.problem.zeros, self.x[self._zeros :], strict=True)}
+        found = self.x[self.problem.film_parameters :]
+        zeros = {zero[:2]: value for zero, value in zip(self.problem.zeros, found, strict=True)}
         x[problem.film_parameters :] = [zeros.get(zero[:2], 0.0) for zero in problem.zeros]
         return x
-
-    @property
-    def _zeros(self) -> int:
-        return self.problem.film_parameters
 
 
 def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort: tuple[float, int]) -> _Fit | None:
@@ -217,14 +209,7 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort:
     import lmfit
 
     n = problem.terms
-    lower = np.full(start.size, -np.inf)
-    upper = np.full(start.size, np.inf)
-    lower[:n], upper[:n] = SHARE_BOUNDS
-    negative = start[n : 2 * n] < 0.0
-    lower[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[1], EXPONENT_BOUNDS[0])
-    upper[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[0], EXPONENT_BOUNDS[1])
-    if problem.electric:
-        lower[2 * n], upper[2 * n] = PERMITTIVITY_BOUNDS
+    lower, upper = _bounds(problem, start)
     varied = np.array([name not in held for name in problem.names])
     margin = np.where(np.isfinite(upper - lower), 1e-3 * (upper - lower), 0.0)
     start = np.where(varied, np.clip(start, lower + np.minimum(margin, 1e-3), upper - margin), start)
@@ -251,7 +236,7 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort:
     minimiser = lmfit.Minimizer(residual, parameters, scale_covar=False, nan_policy="raise")
     with python_warnings.catch_warnings(), np.errstate(all="ignore"):
         # lmfit takes square roots of its own covariance, which is not positive definite for terms that are not
-        # identifiable. Ours (`_Covariance`) is used instead.
+        # identifiable. Ours (`calibration.propagation.Covariance`) is used instead.
         python_warnings.simplefilter("ignore")
         out = minimiser.minimize(
             method="least_squares", jac=jacobian, x_scale="jac", ftol=tolerance, xtol=1e-9, gtol=1e-9, max_nfev=budget
@@ -266,16 +251,21 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort:
         order = np.argsort(x[n : 2 * n])
         order = np.concatenate((order, n + order, np.arange(2 * n, x.size)))
         x, at_bound = x[order], at_bound[order]
-    return _Fit(
-        problem,
-        x,
-        float(final @ final),
-        bool(out.success),
-        int(out.nfev),
-        varied,
-        at_bound,
-        getattr(out, "covar", None),
-    )
+    return _Fit(problem, x, float(final @ final), bool(out.success), int(out.nfev), varied, at_bound)
+
+
+def _bounds(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Lower and upper bounds of a parameter vector; exponents keep the sign they have in ``x``."""
+    n = problem.terms
+    lower = np.full(x.size, -np.inf)
+    upper = np.full(x.size, np.inf)
+    lower[:n], upper[:n] = SHARE_BOUNDS
+    negative = x[n : 2 * n] < 0.0
+    lower[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[1], EXPONENT_BOUNDS[0])
+    upper[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[0], EXPONENT_BOUNDS[1])
+    if problem.electric:
+        lower[2 * n], upper[2 * n] = PERMITTIVITY_BOUNDS
+    return lower, upper
 
 
 def _representative(fits: Sequence[_Fit]) -> _Fit:
@@ -302,7 +292,13 @@ def _other_minima(fits: Sequence[_Fit]) -> list[str]:
 
 
 def _assemble(
-    fit: _Fit, fits: Sequence[_Fit], held: Mapping[str, float], notes: Sequence[str], provenance: dict[str, Any]
+    fit: _Fit,
+    fits: Sequence[_Fit],
+    held: Mapping[str, float],
+    notes: Sequence[str],
+    provenance: dict[str, Any],
+    *,
+    profiles: bool,
 ) -> Identification:
     """The result of ``fit``; ``fits`` are the minima from all starting points, best first."""
     problem, x = fit.problem, fit.x
@@ -314,6 +310,11 @@ def _assemble(
     misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
     rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits]
     stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals)
+    quantities = stated.quantities
+    if profiles:
+        aims = targets(problem, stated.stretch, held)
+        found = intervals(problem, x, _bounds(problem, x), fit.varied, quantities, aims, misfit)
+        quantities.update({name: widened(quantities[name], ends, misfit) for name, ends in found.items()})
     curves = _curve_results(problem, x)
     used = sum(curve.used for curve in curves)
     reduced = problem.residual(x)[: problem.data_rows]
@@ -324,7 +325,7 @@ def _assemble(
     crowding = 2.0 * free * (free + 1) / (effective - free - 1) if effective > free + 1 else math.inf
     result = Identification(
         material=replace(problem.film(x), source="identified from force-displacement curves"),
-        quantities=stated.quantities,
+        quantities=quantities,
         stretch=stated.stretch,
         stiffness_curve=stated.stiffness_curve,
         nuisance=stated.nuisance,
@@ -344,6 +345,7 @@ def _assemble(
         starts=len(fits),
         starts_agreeing=sum(other.cost - fits[0].cost < SAME_MINIMUM for other in fits),
         warnings=[],
+        advice=[] if held else advice(problem.curves, problem.film(x), stated.quantities),
         provenance=provenance,
     )
     return replace(result, warnings=[*_warnings(result, problem, fit), *notes])

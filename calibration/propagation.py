@@ -35,10 +35,10 @@ def secant_modulus(material: Material, meridional: float, hoop: float) -> float:
     It is what a force measures, since ``2 pi R (T/lp) S1 sin(theta) = F``. For small strains it becomes ``G``.
     """
     mu, alpha = np.array(material.mu), np.array(material.alpha)
-    return float(_secant(mu, alpha, np.array([meridional]), hoop)[0][0])
+    return float(secant(mu, alpha, np.array([meridional]), hoop)[0][0])
 
 
-def _secant(mu: Array, alpha: Array, meridional: Array, hoop: float) -> tuple[Array, Array, Array]:
+def secant(mu: Array, alpha: Array, meridional: Array, hoop: float) -> tuple[Array, Array, Array]:
     """Secant modulus at k meridional stretches, with derivatives by mu and by alpha; shapes (k,), (k, N), (k, N)."""
     l1 = meridional[:, None]
     stretch = l1**alpha - (l1 * hoop) ** -alpha
@@ -195,7 +195,7 @@ def state(
     hoop = float(np.mean([problem.curves[i].specimen.prestretch for i in problem.active]))
     longest = max(float(problem.states(x).max_stretch.max()), hoop + 0.02)
     stretches = np.arange(math.floor(hoop * 100) + 1, math.floor(longest * 100) + 1) / 100
-    _, by_mu, by_alpha = _secant(mu, alpha, stretches, hoop)
+    _, by_mu, by_alpha = secant(mu, alpha, stretches, hoop)
     along = [
         propagation.quantity(partial(secant_modulus, meridional=stretch, hoop=hoop), gradient(a, b), "Pa")
         for stretch, a, b in zip(stretches, by_mu, by_alpha, strict=True)

@@ -138,9 +138,9 @@ def _row(name: str, quantity: Quantity, known: Mapping[str, float]) -> _Row:
     }[base if base in ("mu", "alpha") else name]
     factor, unit = (1e-3, "kPa") if quantity.unit == "Pa" else (1.0, "")
     value, uncertainty = rounded(quantity.value * factor, quantity.uncertainty * factor)
+    ends = quantity.interval or tuple(quantity.value + k * quantity.uncertainty for k in (-1.96, 1.96))
     low, high = (
-        rounded((quantity.value + k * quantity.uncertainty) * factor, quantity.uncertainty * factor)[0]
-        for k in (-1.96, 1.96)
+        rounded(end * factor, quantity.uncertainty * factor)[0] if math.isfinite(end) else "no bound" for end in ends
     )
     known_here = name in known
     return _Row(

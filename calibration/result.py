@@ -30,7 +30,8 @@ class Quantity:
     """One identified number.
 
     ``uncertainty`` is the combined standard uncertainty (k = 1); ``budget`` holds its independent parts, which add in
-    squares. ``verdict`` is "identified", "weakly identified" or "not identifiable from this data".
+    squares. ``verdict`` is "identified", "weakly identified" or "not identifiable from this data". ``interval`` is the
+    95 % interval by profile likelihood, where one was asked for; an end that the data do not set is infinite.
     """
 
     value: float
@@ -39,6 +40,7 @@ class Quantity:
     budget: dict[str, float]
     verdict: str
     at_bound: bool = False
+    interval: tuple[float, float] | None = None
 
     @property
     def relative(self) -> float:
@@ -116,6 +118,8 @@ class Identification:
         Correlations of the raw parameters.
     condition : float
         Condition number of the least-squares problem in relative changes of the raw parameters.
+    warnings, advice : list of str
+        What speaks against the result; which further measurement would determine the Ogden terms better.
     aicc, bic : float
         Information criteria; smaller is better, differences below 2 mean nothing.
     """
@@ -141,6 +145,7 @@ class Identification:
     starts: int
     starts_agreeing: int
     warnings: list[str]
+    advice: list[str]
     provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -224,6 +229,7 @@ class Identification:
                 for c in self.curves
             ],
             "warnings": self.warnings,
+            "advice": self.advice,
             "provenance": self.provenance,
         }
 
@@ -240,6 +246,7 @@ def quantity_dict(quantity: Quantity) -> dict[str, Any]:
         "budget": {part: _finite(value) for part, value in quantity.budget.items()},
         "verdict": quantity.verdict,
         "at_bound": quantity.at_bound,
+        "interval_95": None if quantity.interval is None else [_finite(end) for end in quantity.interval],
     }
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from calibration.curve import Curve
+from calibration.identifiability import expected_uncertainties
 from calibration.identify import (
     IdentificationError,
     compare,
-    expected_uncertainties,
     identify,
     secant_modulus,
 )
@@ -63,6 +63,7 @@ def test_the_two_term_set_is_called_not_identifiable(paper: Identification) -> N
     assert paper.quantities["alpha1"].verdict == "not identifiable from this data"
     assert any("not determined by this data" in warning and "mu1" in warning for warning in paper.warnings)
     assert paper.material.alpha == tuple(sorted(paper.material.alpha))
+    assert any("would bring" in words for words in paper.advice)
 
 
 def test_right_model_and_right_noise_give_a_chi_square_of_one(paper: Identification) -> None:
