@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model import ritz
 from model.law import Array, relax, stack, stress
@@ -36,7 +37,7 @@ class Profile:
     stress_1: Array
     stress_2: Array
     field: Array
-    wrinkled: Array
+    wrinkled: NDArray[np.bool_]
 
 
 def profile(

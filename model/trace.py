@@ -26,7 +26,7 @@ class Trace:
     grid: Grid
     state: State
     reached: NDArray[np.bool_]
-    limit: NDArray[np.bool_]  # ended before, where the film loses its stability
+    limit: NDArray[np.bool_]  # a limit point is where the path ends, or close
     steps: NDArray[np.intp]
 
 
@@ -49,6 +49,12 @@ def lowest(problem: Problem, grid: Grid, state: State) -> Array:
     out = np.full(len(good), -np.inf)
     out[good] = np.linalg.eigvalsh(matrix[good])[:, 0]
     return out
+
+
+def _no_width(problem: Problem, grid: Grid, state: State) -> NDArray[np.bool_]:
+    """Where hoop tension is about to vanish and the film has no natural width: it would widen without bound."""
+    law = ritz.evaluate(problem, grid, State(state.c, state.w)).law
+    return np.asarray(((law.t2 < 0.1 * law.t1) & (law.h22 <= 0.0)).any(axis=(0, 1)))
 
 
 def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
@@ -109,8 +115,10 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
         alive[size < LEAST_STEP] = False
     reached = alive & (progress >= end)
     limit = np.zeros(states, dtype=np.bool_)
-    dead = np.flatnonzero(~reached & np.isfinite(begun) & (begun > 0.0))
-    if len(dead):
-        left = lowest(_at(problem, dead, progress[dead]), grid.take(dead), current.take(dead))
-        limit[dead] = left < SOFT * begun[dead]
+    some = np.flatnonzero(np.isfinite(begun) & (begun > 0.0))
+    if len(some):
+        end_of = _at(problem, some, progress[some]), grid.take(some), current.take(some)
+        limit[some] = lowest(*end_of) < SOFT * begun[some]
+        if relaxed:
+            limit[some] |= _no_width(*end_of)
     return Trace(grid, current, reached, limit, steps)
