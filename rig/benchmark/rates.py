@@ -1,0 +1,463 @@
+"""Rates over real serial ports: does every sample arrive, and what part of a processor core does that take?
+
+The simulated bench runs in a process of its own behind pseudo-terminals, with the force amplifier at 1 kHz, the stage
+polled at 50 Hz and the laser at 100 Hz. First only the three serial drivers are polled, in the engine's manner; then
+a whole run with high voltage and log. POSIX only.
+
+Lost samples are counted by their noise. What the simulated amplifier adds to its n-th frame follows from the scene's
+seed, so that every reading tells which frame it is, and no clock is needed to see that one is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time  # what work costs; when things happen is the clock's business
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.gsv8 import Decoder, Measured
+from drivers.roles import Device, ForceSample, Sample
+from rig import experiment
+from rig.bench import Bench
+from rig.clock import RealClock
+from rig.engine import LONGEST_TURN_S, SETUP_LIMIT_S, SHORTEST_TURN_S
+from rig.errors import RigError
+from rig.log.reader import read_log
+from rig.log.schema import ROLES
+from rig.scene import Scene, load_scene
+from rig.sim.bench import SimulatedBench
+from rig.sim.wire import ByteWire
+from rig.toml_file import validate
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]  # share done, what is being done
+
+FORCE_HZ, STAGE_HZ, LASER_HZ = 1000.0, 50.0, 100.0
+ALLOWED_SHARE = 0.25  # of a core, for the host
+DRIVERS, WHOLE_RUN = "three serial drivers", "whole run with high voltage and log"
+RUN_SHARE = 0.4  # of the progress bar
+
+# From the scene of the examples to this one. Short ways; and time-outs with patience, they are not what is measured.
+CHANGES = {
+    'driver = "zaber"\napproach_from_mm = 36.0': f'driver = "zaber"\npoll_rate_Hz = {STAGE_HZ}\n'
+    "approach_from_mm = 5.0\ntimeout_s = 2.0",
+    "rate_Hz = 100.0": f"rate_Hz = {FORCE_HZ}\ntimeout_s = 2.0",
+    'driver = "keyence-lkg"': f'driver = "keyence-lkg"\npoll_rate_Hz = {LASER_HZ}\ntimeout_s = 2.0',
+    'driver = "iseg-edcp"': 'driver = "iseg-edcp"\ntimeout_s = 2.0',
+    "contact_position_mm = 40.0": "contact_position_mm = 7.0",
+    "[simulation.film]": "[simulation.stage]\nstart_position_mm = 2.0\n\n[simulation.film]",
+    "[simulation.force]": f"[simulation.force]\nstored_rate_Hz = {FORCE_HZ}",
+}
+
+SAME = 0.2  # two readings differ by their noise alone if they do within this many of its standard deviations
+TELLING = 20  # that many neighbours are never the same by chance
+MOST_SKIPPED = 500  # readings, where one loss follows so close on another that none of them can be placed
+
+
+@dataclass(frozen=True)
+class Polled:
+    """One instrument that answers questions. Round trips are NaN where they were not measured."""
+
+    role: str
+    wanted_Hz: float
+    reached_Hz: float
+    round_trip_mean_ms: float
+    round_trip_max_ms: float
+    retries: int
+    missed: int  # polls whose time had passed before they could be sent
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way of working.
+
+    ``expected`` is rate times time; ``lost`` is counted by the noise between the first and the last reading;
+    ``believed_lost`` is how many the driver (in a log: the time stamps) leaves room for. Shares are processor time
+    over time; the simulator's is NaN where the system does not tell it.
+    """
+
+    what: str
+    seconds: float
+    expected: float
+    received: int
+    lost: int
+    believed_lost: int
+    host_share: float
+    simulator_share: float
+    polled: list[Polled]
+
+    @property
+    def used_of_allowed(self) -> float:
+        """Ratio of the host's share of a core to what it may use."""
+        return self.host_share / ALLOWED_SHARE
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the benchmark of rates found."""
+
+    full: bool
+    rows: list[Row]
+    environment: dict[str, str]
+
+
+def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None) -> Report:
+    """Poll for 10 s (full: 60 s), then a whole run of half a minute; write ``rates.json`` and ``rates.png``."""
+    report = measure(60.0 if full else 10.0, full=full, progress=progress)
+    save(report, out_dir)
+    return report
+
+
+def measure(
+    seconds: float,
+    *,
+    full: bool = False,
+    whole_run: bool = True,
+    progress: Progress = lambda share, what: None,
+) -> Report:
+    """Poll for ``seconds``; with ``whole_run``, carry out the short protocol too."""
+    with TemporaryDirectory(prefix="dea-rig-rates-") as name:
+        folder = Path(name)
+        path = folder / "scene.toml"
+        path.write_text(scene_text(), encoding="utf-8")
+        load_before = _load()
+        share = 1.0 - RUN_SHARE if whole_run else 1.0
+        rows = [_drivers(path, seconds, lambda done: progress(share * done, DRIVERS))]
+        if whole_run:
+            rows.append(_whole_run(path, folder, lambda done: progress(share + RUN_SHARE * done, WHOLE_RUN)))
+    environment = {
+        "python": platform.python_version(),
+        "system": platform.system(),
+        "processors": str(os.cpu_count()),
+        "load before": load_before,
+        "load after": _load(),
+    }
+    return Report(full, rows, environment)
+
+
+def save(report: Report, out_dir: Path) -> None:
+    """Write the report as JSON and a picture."""
+    out_dir.mkdir(parents=True, exist_ok=True)
+    rows = [asdict(row) | {"used_of_allowed": row.used_of_allowed} for row in report.rows]
+    for table in [*rows, *(polled for row in rows for polled in row["polled"])]:
+        for key, value in table.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                table[key] = None
+    content = {
+        "full": report.full,
+        "allowed_share": ALLOWED_SHARE,
+        "rows": rows,
+        "environment": report.environment,
+    }
+    text = json.dumps(content, indent=1, allow_nan=False)
+    (out_dir / "rates.json").write_text(text + "\n", encoding="utf-8")
+    _draw(report, out_dir / "rates.png")
+
+
+# ---- the two ways of working
+
+
+def scene_text() -> str:
+    """The scene: that of the examples with a disk of 4 mm, at these rates."""
+    fixtures = Path(str(files("sim_fixtures")))
+    text = (fixtures / "scenes" / "cone-4mm.toml").read_text(encoding="utf-8")
+    for old, new in (CHANGES | {"../calibrations": (fixtures / "calibrations").as_posix()}).items():
+        if old not in text:
+            raise ValueError(f"the example scene has no {old!r} any more")
+        text = text.replace(old, new)
+    return text
+
+
+def _drivers(path: Path, seconds: float, progress: Callable[[float], None]) -> Row:
+    scene, _ = load_scene(path)
+    readings: list[float] = []
+    counts: dict[str, int] = {}
+    with _simulator(path) as (simulator, ports), closing(Bench(_without_hv(scene).with_ports(ports))) as bench:
+        clock, devices = bench.clock, bench.devices
+        bench.attach(lambda role, way, data: None)
+        give_up = clock.now() + SETUP_LIMIT_S
+        while not all(device.ready for device in devices.values()):
+            _turn(bench)
+            if clock.now() > give_up:
+                raise RigError(f"The simulated bench was not set up within {SETUP_LIMIT_S:.0f} s.")
+        before = {role: dict(device.counters) for role, device in devices.items()}
+        for device in devices.values():
+            device.counters["round_trip_max_us"] = 0  # without those of the set-up
+        begun, used, used_there = clock.now(), process_time(), _processor_time(simulator)
+        next_progress = begun
+        while clock.now() < begun + seconds:
+            for role, sample in _turn(bench):
+                counts[role] = counts.get(role, 0) + 1
+                if isinstance(sample, ForceSample):
+                    readings.append(sample.reading)
+            if clock.now() >= next_progress:
+                next_progress += 0.2
+                progress((clock.now() - begun) / seconds)
+        elapsed = clock.now() - begun
+        host, there = process_time() - used, _processor_time(simulator) - used_there
+        rates = {"stage": STAGE_HZ, "displacement": LASER_HZ}
+        polled = [
+            _polled(role, wanted, counts.get(role, 0) / elapsed, devices[role], before[role])
+            for role, wanted in rates.items()
+        ]
+        believed = devices["force"].counters["lost_samples"] - before["force"]["lost_samples"]
+    return Row(
+        DRIVERS,
+        elapsed,
+        FORCE_HZ * elapsed,
+        len(readings),
+        count_lost(readings, sent_readings(scene, elapsed + SETUP_LIMIT_S), _noise(scene)),
+        believed,
+        host / elapsed,
+        there / elapsed,
+        polled,
+    )
+
+
+def _turn(bench: Bench) -> list[tuple[str, Sample]]:
+    """One turn as `rig.engine.Engine` makes it, without what it does with the samples."""
+    now = bench.clock.now()
+    samples = [(role, sample) for role, device in bench.devices.items() for sample in device.poll(now)]
+    wanted = min(device.next_poll for device in bench.devices.values())
+    bench.clock.sleep_until(min(max(wanted, now + SHORTEST_TURN_S), now + LONGEST_TURN_S))
+    return samples
+
+
+def _polled(role: str, wanted: float, reached: float, device: Device, before: dict[str, int]) -> Polled:
+    now = device.counters
+    new = {key: now[key] - before[key] for key in ("round_trips", "round_trip_sum_us", "retries", "polls_missed")}
+    mean = new["round_trip_sum_us"] / new["round_trips"] if new["round_trips"] else math.nan
+    longest = now["round_trip_max_us"]
+    return Polled(role, wanted, reached, 1e-3 * mean, 1e-3 * longest, new["retries"], new["polls_missed"])
+
+
+def _whole_run(path: Path, folder: Path, progress: Callable[[float], None]) -> Row:
+    scene, _ = load_scene(path)
+    protocol = Path(str(files("sim_fixtures"))) / "protocols" / "short.toml"
+    log_path = folder / "run.mcap"
+    clock = RealClock()
+    with _simulator(path) as (simulator, ports):
+        marks: list[tuple[float, float, float]] = []  # time, processor time here and there
+
+        def note(done: float, total: float, _: str) -> None:
+            marks.append((clock.now(), process_time(), _processor_time(simulator)))
+            progress(done / total)
+
+        experiment.run(experiment.prepare(path, protocol, ports), log_path, note)
+    elapsed, host, there = np.subtract(marks[-1], marks[0])
+    log = read_log(log_path)
+    tables = log.tables(["/force/sample", "/stage/sample", "/displacement/sample"])
+    t = tables["/force/sample"]["t_s"]
+    gaps = np.round(np.diff(t) * FORCE_HZ) - 1
+    rates = {"stage": STAGE_HZ, "displacement": LASER_HZ}
+    reached = {role: len(t) / (t[-1] - t[0]) for role in rates for t in (tables[f"/{role}/sample"]["t_s"],)}
+    readings = tables["/force/sample"]["reading_mV_per_V"]
+    lasted = float(t[-1] - t[0])
+    return Row(
+        WHOLE_RUN,
+        float(elapsed),
+        FORCE_HZ * lasted + 1,
+        len(readings),
+        count_lost(readings, sent_readings(scene, lasted + SETUP_LIMIT_S), _noise(scene)),
+        int(gaps[gaps > 0].sum()) + sum(log.missing.get(f"/{role}/sample", 0) for role in ROLES),
+        float(host / elapsed),
+        float(there / elapsed),
+        [Polled(role, rates[role], reached[role], math.nan, math.nan, 0, 0) for role in rates],
+    )
+
+
+@contextmanager
+def _simulator(scene: Path) -> Iterator[tuple[int, dict[str, dict[str, object]]]]:
+    """``dea-rig sim`` as a process of its own: its number and its ports."""
+    process = subprocess.Popen([sys.executable, "-m", "rig", "sim", str(scene)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        if not line:
+            raise RigError("The simulated bench did not start; its own message stands above.")
+        yield process.pid, json.loads(line)
+    finally:
+        process.terminate()
+        process.communicate(timeout=10)
+
+
+def _without_hv(scene: Scene) -> Scene:
+    raw = scene.model_dump(exclude_none=True)
+    del raw["hv"]
+    for key in ("voltage_V", "current_uA", "field_V_per_um"):
+        raw["limits"].pop(key, None)
+    return validate(raw, Scene, "scene", "scene without high voltage")
+
+
+def _processor_time(process: int) -> float:
+    """Seconds of processor time of another process; NaN where the system has no ``/proc``."""
+    stat = Path(f"/proc/{process}/stat")
+    if not stat.exists():
+        return math.nan
+    fields = stat.read_text().rpartition(")")[2].split()  # the name before may hold blanks
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _load() -> str:
+    return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+
+
+# ---- counting by noise
+
+
+def sent_readings(scene: Scene, seconds: float) -> Array:
+    """What the simulated amplifier sends in its first ``seconds``, in mV/V, with nothing touching the film."""
+    assert scene.simulation is not None
+    bench = SimulatedBench(scene.simulation, scene.specimen.specimen(), {"force"})
+    wire = bench.wire("force")
+    assert isinstance(wire, ByteWire)
+    decoder = Decoder()
+    found: list[float] = []
+    for i in range(1, math.ceil(seconds / 0.1) + 1):
+        bench.advance(0.1 * i)
+        for frame in decoder.feed(wire.host_read(0.1 * i)):
+            assert isinstance(frame, Measured)
+            found.append(frame.values[scene.force.channel - 1])
+    return np.array(found)
+
+
+def _noise(scene: Scene) -> float:
+    """Standard deviation of the noise, mV/V."""
+    assert scene.simulation is not None
+    truth = scene.simulation.force
+    return truth.noise_fraction * truth.sensitivity_mV_per_V
+
+
+def count_lost(received: Sequence[float] | Array, sent: Array, noise: float) -> int:
+    """Samples of ``sent`` that are missing in ``received`` between its first and its last.
+
+    ``received`` may have any slowly changing force added to it. With ``r`` and ``s`` the steps between neighbours, the
+    place of ``received[i]`` in ``sent`` is the ``j`` for which ``r[i..] - s[j..]`` is small, `TELLING` steps long.
+
+    Raises
+    ------
+    ValueError
+        The readings are not those that were sent.
+    """
+    r, s = np.diff(received), np.diff(sent)
+    if len(r) < TELLING:
+        raise ValueError(f"{len(r) + 1} readings are too few to be recognised")
+    i, place = _next_match(r, s, noise)
+    first = place - i
+    while True:
+        n = min(len(r) - i, len(s) - place)
+        wrong = np.flatnonzero(np.abs(r[i : i + n] - s[place : place + n]) > SAME * noise)
+        if wrong.size == 0:
+            break
+        # The step into a reading is not the one that was sent: something is missing before it. Go on from there.
+        i, place = i + int(wrong[0]) + 1, place + int(wrong[0]) + 1
+        if len(r) - i < TELLING:
+            break
+        skipped, ahead = _next_match(r[i:], s[place:], noise)
+        if ahead < skipped:
+            raise ValueError("readings were received that the amplifier did not send in this order")
+        i, place = i + skipped, place + ahead
+    if len(r) - i > len(s) - place:
+        raise ValueError("more readings were received than sent")
+    return place - i - first
+
+
+def _next_match(r: Array, s: Array, noise: float) -> tuple[int, int]:
+    """The first place in ``r`` from which `TELLING` steps stand somewhere in ``s``, and where."""
+    if len(s) >= TELLING:
+        windows = np.lib.stride_tricks.sliding_window_view(s, TELLING)
+        for i in range(min(len(r) - TELLING + 1, MOST_SKIPPED)):
+            fits = np.flatnonzero(np.all(np.abs(windows - r[i : i + TELLING]) <= SAME * noise, axis=1))
+            if fits.size:
+                return i, int(fits[0])
+    raise ValueError("readings were received that the amplifier did not send in this order")
+
+
+# ---- showing
+
+
+def render(report: Report) -> RenderableType:
+    """Tables for the terminal."""
+    from rich.console import Group
+    from rich.table import Table
+
+    force = Table(
+        title=f"Force at {FORCE_HZ:.0f} Hz over a pseudo-terminal, stage and laser polled beside it",
+        caption="Lost: counted by the simulator's own noise. Believed lost: room that the time stamps leave. "
+        f"Used/allowed: of {ALLOWED_SHARE:.0%} of a core.",
+    )
+    for heading in ("", "s", "expected", "received", "lost", "believed lost", "host", "simulator", "used/allowed"):
+        force.add_column(heading, justify="right" if heading else "left")
+    for row in report.rows:
+        force.add_row(
+            row.what,
+            f"{row.seconds:.1f}",
+            f"{row.expected:.0f}",
+            str(row.received),
+            str(row.lost),
+            str(row.believed_lost),
+            f"{row.host_share:.1%}",
+            f"{row.simulator_share:.1%}" if math.isfinite(row.simulator_share) else "unknown",
+            f"{row.used_of_allowed:.2f}",
+        )
+    polled = Table(title="Polled instruments")
+    for heading in ("", "", "wanted / Hz", "reached / Hz", "round trip / ms", "longest / ms", "retries", "missed"):
+        polled.add_column(heading, justify="right" if heading else "left")
+    for row in report.rows:
+        for p in row.polled:
+            times = p.round_trip_mean_ms, p.round_trip_max_ms
+            measured = math.isfinite(p.round_trip_mean_ms)
+            polled.add_row(
+                row.what if p is row.polled[0] else "",
+                p.role,
+                f"{p.wanted_Hz:g}",
+                f"{p.reached_Hz:.2f}",
+                *(f"{time:.1f}" if measured else "" for time in times),
+                *(str(number) if measured else "" for number in (p.retries, p.missed)),
+            )
+    setting = ", ".join(f"{name} {value}" for name, value in report.environment.items())
+    return Group(force, polled, f"Measured on: {setting}.")
+
+
+def _draw(report: Report, path: Path) -> None:
+    """Shares of a core, one pair of bars a row."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 1.6 + 0.7 * len(report.rows)), layout="constrained")
+    axes = figure.subplots()
+    rows = report.rows[::-1]
+    for offset, colour, who, shares in (
+        (0.19, "#0072B2", "host", [row.host_share for row in rows]),
+        (-0.19, "#999999", "simulated bench", [row.simulator_share for row in rows]),
+    ):
+        at = np.arange(len(rows)) + offset
+        percent = 100 * np.nan_to_num(np.array(shares))
+        axes.barh(at, percent, height=0.36, color=colour, label=who)
+        for y, x in zip(at, percent, strict=True):
+            axes.text(x + 0.3, y, f"{x:.1f} %", va="center", fontsize=9)
+    axes.axvline(100 * ALLOWED_SHARE, color="#D55E00", linestyle="--", label="allowed for the host")
+    labels = [f"{row.what}\n{row.lost} of {row.received + row.lost} samples lost" for row in rows]
+    axes.set_yticks(range(len(rows)), labels)
+    axes.set_xlabel("processor time / % of a core")
+    axes.set_title(
+        f"Force at {FORCE_HZ:.0f} Hz, stage at {STAGE_HZ:.0f} Hz, laser at {LASER_HZ:.0f} Hz over serial ports"
+    )
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=110)
