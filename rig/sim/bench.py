@@ -15,19 +15,34 @@ from typing import Protocol
 import numpy as np
 
 from model.specimen import Specimen
+from rig.sim.cia404 import CiA404
 from rig.sim.faults import Upset
 from rig.sim.film import Solve, solve_membrane
 from rig.sim.gsv8 import GSV8
 from rig.sim.iseg import IsegEDCP
 from rig.sim.keyence import KeyenceLKG
-from rig.sim.settings import LINK_FAULTS, Fault, LinkTruth, SimulationSettings
+from rig.sim.settings import (
+    LINK_FAULTS,
+    CiA404Truth,
+    DisplacementTruth,
+    Fault,
+    ForceTruth,
+    HVTruth,
+    LinkTruth,
+    ShvpsTruth,
+    SimulationSettings,
+    StageTruth,
+)
+from rig.sim.shvps import Shvps
 from rig.sim.wire import ByteWire, FrameWire
 from rig.sim.world import World
 from rig.sim.zaber import ZaberStage
 
 ROLES = ("stage", "force", "displacement", "hv")
 
-Instrument = ZaberStage | GSV8 | KeyenceLKG | IsegEDCP
+OnLine = ZaberStage | GSV8 | KeyenceLKG | Shvps
+OnBus = IsegEDCP | CiA404
+Instrument = OnLine | OnBus
 
 
 class _Timed(Protocol):
@@ -66,8 +81,8 @@ class SimulatedBench:
         self.settings = settings
         self.world = World(settings, specimen, "hv" in roles, solve)
         self.instruments: dict[str, Instrument] = {}
-        self._bytes: dict[str, ByteWire] = {}
-        self._frames: dict[str, FrameWire] = {}
+        self._lines: dict[str, tuple[ByteWire, OnLine]] = {}
+        self._buses: dict[str, tuple[FrameWire, OnBus]] = {}
         self._upsets: dict[tuple[str, str], Upset] = {}
         self.now = 0.0
         for role in ROLES:
@@ -76,7 +91,7 @@ class SimulatedBench:
         # The order of things that happen at one time: sensors see the world as it was, then it moves on.
         self._sensors: list[_Timed] = [self.instruments[r] for r in ("force", "displacement") if r in roles]
         self._actors: list[_Timed] = [self.world, *(self.instruments[r] for r in ("stage", "hv") if r in roles)]
-        self._wires: list[ByteWire | FrameWire] = [*self._bytes.values(), *self._frames.values()]
+        self._wires: list[ByteWire | FrameWire] = [self.wire(role) for role in self.instruments]
         self._due: list[tuple[float, int, bool, Fault]] = []
         self._injected = 0
         for fault in settings.fault:
@@ -87,21 +102,32 @@ class SimulatedBench:
         return np.random.default_rng([self.settings.seed & 0xFFFF_FFFF_FFFF_FFFF, zlib.crc32(name.encode())])
 
     def _build(self, role: str) -> None:
-        s = self.settings
-        if role == "hv":
-            bus = FrameWire(s.hv.latency_ms * 1e-3, s.hv.bitrate)
-            self._frames[role] = bus
-            self.instruments[role] = IsegEDCP(s.hv, self.world, bus, self._rng(role))
-            return
-        wire = _wire({"stage": s.stage.link, "force": s.force.link, "displacement": s.displacement.link}[role])
-        self._bytes[role] = wire
-        match role:
-            case "stage":
-                self.instruments[role] = ZaberStage(s.stage, self.world, wire)
-            case "force":
-                self.instruments[role] = GSV8(s.force, self.world, wire, self._rng(role))
-            case "displacement":
-                self.instruments[role] = KeyenceLKG(s.displacement, self.world, wire, self._rng(role))
+        s, rng = self.settings, self._rng(role)
+        truth = {"stage": s.stage, "force": s.force, "displacement": s.displacement, "hv": s.hv}[role]
+        match truth:
+            case HVTruth() | CiA404Truth():
+                bus = FrameWire(truth.latency_ms * 1e-3, truth.bitrate)
+                node: OnBus
+                if isinstance(truth, HVTruth):
+                    node = IsegEDCP(truth, self.world, bus, rng)
+                else:
+                    node = CiA404(truth, self.world, bus, rng)
+                self._buses[role] = bus, node
+                self.instruments[role] = node
+                return
+        wire = _wire(truth.link)
+        instrument: OnLine
+        match truth:
+            case StageTruth():
+                instrument = ZaberStage(truth, self.world, wire)
+            case ForceTruth():
+                instrument = GSV8(truth, self.world, wire, rng)
+            case ShvpsTruth():
+                instrument = Shvps(truth, self.world, wire, rng)
+            case DisplacementTruth():
+                instrument = KeyenceLKG(truth, self.world, wire, rng)
+        self._lines[role] = wire, instrument
+        self.instruments[role] = instrument
 
     def prepare(self) -> None:
         """Do now what takes long (the film's table), so that nothing waits for it later."""
@@ -109,7 +135,7 @@ class SimulatedBench:
 
     def wire(self, role: str) -> ByteWire | FrameWire:
         """The wire to the instrument of ``role``; the host uses its ``host_write`` and ``host_read``."""
-        return self._frames[role] if role in self._frames else self._bytes[role]
+        return self._buses[role][0] if role in self._buses else self._lines[role][0]
 
     # Time
 
@@ -149,18 +175,14 @@ class SimulatedBench:
                 self._switch(fault, number, begins, step)
 
     def _deliver(self, t: float) -> None:
-        for role, wire in self._bytes.items():
+        for wire, instrument in self._lines.values():
             if wire.next_delivery <= t:
-                instrument = self.instruments[role]
-                assert not isinstance(instrument, IsegEDCP)
                 for arrived, data in wire.deliveries(t):
                     instrument.receive(data, arrived)
-        for role, bus in self._frames.items():
+        for bus, node in self._buses.values():
             if bus.next_delivery <= t:
-                supply = self.instruments[role]
-                assert isinstance(supply, IsegEDCP)
                 for arrived, frame in bus.deliveries(t):
-                    supply.receive(frame, arrived)
+                    node.receive(frame, arrived)
 
     # Faults
 
@@ -168,6 +190,7 @@ class SimulatedBench:
         """Let something go wrong, from ``fault.at_s`` on, or from now on if that has passed."""
         if fault.role not in self.instruments:
             raise ValueError(f"there is no {fault.role} on this bench to go wrong")
+        self.settings.check(fault)
         self._injected += 1
         begin = max(fault.at_s, self.now)
         if begin > self.now:
@@ -231,21 +254,21 @@ class SimulatedBench:
         match instrument:
             case ZaberStage():
                 instrument.wrong_status = "FS" if begins else None
+            case GSV8() | CiA404() if fault.kind == "saturate":
+                instrument.saturated = _sign(fault) if begins else 0
             case GSV8():
-                if fault.kind == "saturate":
-                    instrument.saturated = (-1 if fault.value is not None and fault.value < 0 else 1) if begins else 0
-                else:
-                    instrument.set_status((3 if fault.value is None else int(fault.value) & 3) if begins else 0)
+                instrument.set_status((3 if fault.value is None else int(fault.value) & 3) if begins else 0)
+            case CiA404():
+                instrument.status_bits = (1 if fault.value is None else int(fault.value) & 7) if begins else 0
             case KeyenceLKG():
                 match fault.kind:
                     case "saturate":
-                        sign = -1 if fault.value is not None and fault.value < 0 else 1
-                        instrument.saturated = sign if begins else 0
+                        instrument.saturated = _sign(fault) if begins else 0
                     case "no_value":
                         instrument.no_value = begins
                     case _:
                         instrument.wrong_status = begins
-            case IsegEDCP():
+            case IsegEDCP() | Shvps():
                 self._switch_supply(instrument, fault, begins, t)
 
     def _alert(self, instrument: ZaberStage | KeyenceLKG, fault: Fault, begins: bool, t: float) -> None:
@@ -268,23 +291,31 @@ class SimulatedBench:
 
         return alert_by_chance
 
-    def _switch_supply(self, supply: IsegEDCP, fault: Fault, begins: bool, t: float) -> None:
+    def _switch_supply(self, supply: IsegEDCP | Shvps, fault: Fault, begins: bool, t: float) -> None:
         match fault.kind:
             case "stuck_on":
                 supply.stuck_on = begins
             case "breakdown":
                 self.world.broken_down = begins
             case "over_current":
-                leak = supply.nominal_i * 2 if fault.value is None else fault.value
+                leak = supply.largest_current * 2 if fault.value is None else fault.value
                 self.world.extra_leakage = leak if begins else 0.0
             case "sag":
                 supply.set_sag(t, (0.5 if fault.value is None else fault.value) if begins else 1.0)
-            case "interlock":
+            case "interlock" if isinstance(supply, IsegEDCP):
                 supply.open_interlock(t, begins)
-            case "inhibit":
+            case "inhibit" if isinstance(supply, IsegEDCP):
                 supply.inhibit(t, begins)
             case "wrong_status":
-                supply.wrong_status = (0xFFFF if fault.value is None else int(fault.value) & 0xFFFF) if begins else 0
+                if isinstance(supply, Shvps):
+                    supply.wrong_mode = int(fault.value or 0) if begins else None
+                else:
+                    bits = 0xFFFF if fault.value is None else int(fault.value) & 0xFFFF
+                    supply.wrong_status = bits if begins else 0
+
+
+def _sign(fault: Fault) -> int:
+    return -1 if fault.value is not None and fault.value < 0 else 1
 
 
 def _wire(link: LinkTruth) -> ByteWire:

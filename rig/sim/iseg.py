@@ -92,6 +92,11 @@ class IsegEDCP:
             live = self._channels[0]
             live.setpoint, live.control, live.on = settings.start_live_V, ON, True
 
+    @property
+    def largest_current(self) -> float:
+        """What a channel can give at most (A)."""
+        return self.nominal_i
+
     def _power_up(self, t: float) -> None:
         limit = self.nominal_i * self._settings.current_limit_percent / 100
         self._channels = [_Channel(current_limit=limit) for _ in range(self._settings.channels)]

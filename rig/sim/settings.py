@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from rig.table import Table
 
@@ -33,6 +33,12 @@ DEVICE_FAULTS: dict[str, tuple[str, ...]] = {
         "inhibit",
     ),
 }
+# Faults that an instrument cannot have although others of its role can.
+IMPOSSIBLE_FAULTS: dict[str, tuple[str, ...]] = {
+    "iseg-edcp": ("split", "merge"),  # a CAN frame is one piece
+    "cia404": ("split", "merge"),
+    "shvps": ("interlock", "inhibit"),  # it has neither input
+}
 
 
 class Fault(Table):
@@ -43,8 +49,8 @@ class Fault(Table):
 
     alert sends unsolicited lines every ``value`` seconds; with ``value = 0`` one between each command and its reply,
     with ``probability``. Otherwise ``value`` is: seconds for delay and split; amperes drawn beside the film for
-    over_current; the part of the voltage that is left for sag; the sign of the rail for saturate; the bit pattern for
-    wrong_status of force and hv.
+    over_current; the part of the voltage that is left for sag; the sign of the rail for saturate; the bit pattern (of
+    the shvps: the mode) for wrong_status of force and hv.
     """
 
     role: Role
@@ -58,8 +64,6 @@ class Fault(Table):
     @model_validator(mode="after")
     def _kind_fits_role(self) -> Self:
         allowed = LINK_FAULTS + DEVICE_FAULTS[self.role]
-        if self.role == "hv":
-            allowed = tuple(kind for kind in allowed if kind not in ("split", "merge"))  # a CAN frame is one piece
         if self.kind not in allowed:
             raise ValueError(f"{self.role} has no fault {self.kind!r}; it has {', '.join(allowed)}")
         return self
@@ -117,22 +121,54 @@ class StageTruth(Table):
     link: LinkTruth = LinkTruth()
 
 
-class ForceTruth(Table):
+class LoadCellTruth(Table):
+    """What every simulated load cell has."""
+
+    full_scale_N: Positive = 0.5
+    gain_error: float = Field(default=0.0, description="hidden relative error of the sensitivity")
+    noise_fraction: NonNegative = Field(default=0.005, description="standard deviation of a sample, of full scale")
+    clock_drift_ppm: float = 0.0
+    reboot_s: Positive = 1.0
+
+
+class ForceTruth(LoadCellTruth):
     """Strain-gauge cell on an ME-Messsysteme GSV-8."""
 
+    driver: Literal["gsv8"] = "gsv8"
     serial_number: int = 14_209_876
     channel: Annotated[int, Field(ge=1, le=8)] = 1
-    full_scale_N: Positive = 0.5
     sensitivity_mV_per_V: Positive = Field(default=2.0, description="nominal output at full scale")
-    gain_error: float = Field(default=0.0, description="hidden relative error of the sensitivity")
     zero_offset_mV_per_V: float = 0.013
-    noise_fraction: NonNegative = Field(default=0.005, description="standard deviation of a sample, of full scale")
     input_range_mV_per_V: Positive = Field(default=3.5, description="input range at 5 V bridge supply")
     raw_range_factor: Positive = Field(default=1.05, description="largest raw number, in input ranges")
     stored_rate_Hz: Positive = Field(default=100.0, description="rate at which it streams after power-up")
-    clock_drift_ppm: float = 0.0
-    reboot_s: Positive = 1.0
     link: LinkTruth = LinkTruth(latency_ms=1.0, baud=0)
+
+
+class CiA404Truth(LoadCellTruth):
+    """Load cell on CANopen, device profile CiA 404; it states newtons or millinewtons itself."""
+
+    driver: Literal["cia404"]
+    serial_number: int = 77_120
+    node: Annotated[int, Field(ge=1, le=127)] = 5
+    inputs: Annotated[int, Field(ge=1, le=4)] = Field(default=1, description="analogue inputs; the others are open")
+    channel: Annotated[int, Field(ge=1, le=4)] = Field(default=1, description="the input with the load cell")
+    bitrate: Literal[125_000, 250_000, 500_000, 1_000_000] = 125_000
+    latency_ms: NonNegative = 0.5
+    unit: Literal["N", "mN"] = "N"
+    decimals: Annotated[int, Field(ge=0, le=6)] = Field(default=4, description="of the integer process values")
+    zero_offset_N: float = 0.004
+    overload_factor: Positive = Field(default=1.2, description="end of the measuring range, in full scales")
+    tare_fraction: Fraction = Field(default=0.2, description="largest value that autozero takes, of full scale")
+    conversion_rate_Hz: Positive = 1000.0
+    stored_event_time_ms: Annotated[int, Field(ge=0, le=65_535)] = Field(default=100, description="1800h:5 at power-up")
+    heartbeat_ms: Annotated[int, Field(ge=0, le=65_535)] = 0
+
+    @model_validator(mode="after")
+    def _channel_exists(self) -> Self:
+        if self.channel > self.inputs:
+            raise ValueError(f"channel is {self.channel}, but there are only {self.inputs} inputs")
+        return self
 
 
 class DisplacementTruth(Table):
@@ -149,9 +185,21 @@ class DisplacementTruth(Table):
     link: LinkTruth = LinkTruth()
 
 
-class HVTruth(Table):
-    """iseg EDCP module on CAN with one channel, and what hangs on its output."""
+class OutputTruth(Table):
+    """What every simulated supply has, and what hangs on its output."""
 
+    fall_time_s: Positive = Field(default=0.05, description="time in which the output falls to zero when cut")
+    gain_error: float = Field(default=0.0, description="hidden relative error of set-point and monitor together")
+    film_capacitance_nF: NonNegative = 0.7
+    leakage_resistance_GOhm: Positive = 20.0
+    arc_resistance_kOhm: Positive = 10.0
+    start_live_V: NonNegative = Field(default=0.0, description="output found on at this voltage; 0: found off")
+
+
+class HVTruth(OutputTruth):
+    """iseg EDCP module on CAN with one channel."""
+
+    driver: Literal["iseg-edcp"] = "iseg-edcp"
     serial_number: int = 484_216
     module: Annotated[int, Field(ge=0, le=63)] = 0
     channels: Annotated[int, Field(ge=1, le=16)] = 1
@@ -161,17 +209,36 @@ class HVTruth(Table):
     nominal_current_mA: Positive = 1.0
     ramp_percent_per_s: Positive = Field(default=10.0, description="voltage ramp at power-up, of nominal")
     max_ramp_percent_per_s: Positive = 20.0
-    fall_time_s: Positive = Field(default=0.05, description="time in which the output falls to zero when cut")
-    gain_error: float = Field(default=0.0, description="hidden relative error of set-point and monitor together")
     voltage_noise_V: NonNegative = 0.3
     current_noise_nA: NonNegative = 5.0
-    film_capacitance_nF: NonNegative = 0.7
-    leakage_resistance_GOhm: Positive = 20.0
-    arc_resistance_kOhm: Positive = 10.0
     voltage_limit_percent: Positive = Field(default=100.0, description="hardware limit, of nominal")
     current_limit_percent: Positive = Field(default=100.0, description="hardware limit, of nominal")
     logon_period_s: Positive = 5.0
-    start_live_V: NonNegative = Field(default=0.0, description="output found on at this voltage; 0: found off")
+
+
+class ShvpsTruth(OutputTruth):
+    """shvps, the peta-pico-Voltron single-channel supply of dielectric-elastomer labs, on a serial port."""
+
+    driver: Literal["shvps"]
+    board: Annotated[str, Field(pattern=r"^[ -~]{1,32}$")] = "HVPS 7"
+    maximum_voltage_V: Annotated[int, Field(ge=1, le=10_000)] = 5000
+    slew_V_per_s: Positive = Field(default=20_000.0, description="how fast the regulated output rises")
+    largest_current_uA: Positive = Field(default=200.0, description="what the converter can give at most")
+    voltage_noise_V: NonNegative = 0.7
+    reading_period_s: Positive = Field(default=0.01, description="of the board's own voltage measurement")
+    answer_ms: NonNegative = 1.0
+    reboot_s: Positive = 2.0
+    power_jack: bool = True
+    link: LinkTruth = LinkTruth()
+
+
+def _twin(default: str) -> Discriminator:
+    """Tells by the key ``driver`` which instrument a table describes; without it, the first of its role."""
+    return Discriminator(lambda t: t.get("driver", default) if isinstance(t, dict) else getattr(t, "driver", default))
+
+
+AnyForceTruth = Annotated[Annotated[ForceTruth, Tag("gsv8")] | Annotated[CiA404Truth, Tag("cia404")], _twin("gsv8")]
+AnyHVTruth = Annotated[Annotated[HVTruth, Tag("iseg-edcp")] | Annotated[ShvpsTruth, Tag("shvps")], _twin("iseg-edcp")]
 
 
 class SimulationSettings(Table):
@@ -179,7 +246,8 @@ class SimulationSettings(Table):
 
     ``contact_position_mm`` is the stage position at which the pusher meets the flat disk. Force and displacement of
     the disk are zero before; beyond it the stage's way is shared between film and rig,
-    ``stage - contact = displacement + compliance x force``.
+    ``stage - contact = displacement + compliance x force``. ``driver`` in the tables ``force`` and ``hv`` says which
+    instrument it is that is simulated; a scene fills it in.
     """
 
     seed: int
@@ -187,7 +255,21 @@ class SimulationSettings(Table):
     rig_compliance_um_per_N: NonNegative = 2.0
     film: FilmTruth = FilmTruth()
     stage: StageTruth = StageTruth()
-    force: ForceTruth = ForceTruth()
+    force: AnyForceTruth = ForceTruth()
     displacement: DisplacementTruth = DisplacementTruth()
-    hv: HVTruth = HVTruth()
+    hv: AnyHVTruth = HVTruth()
     fault: list[Fault] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _faults_are_possible(self) -> Self:
+        for fault in self.fault:
+            self.check(fault)
+        return self
+
+    def check(self, fault: Fault) -> None:
+        """Raise ValueError when the instrument that is simulated in the fault's role cannot have it."""
+        driver: str = {"force": self.force.driver, "hv": self.hv.driver}.get(fault.role, "")
+        impossible = IMPOSSIBLE_FAULTS.get(driver, ())
+        if fault.kind in impossible:
+            allowed = [kind for kind in LINK_FAULTS + DEVICE_FAULTS[fault.role] if kind not in impossible]
+            raise ValueError(f"{fault.role} ({driver}) has no fault {fault.kind!r}; it has {', '.join(allowed)}")

@@ -54,13 +54,14 @@ class Host:
         self.bench.advance(self.t)
         return self.bench.wire(role).host_read(self.t)
 
-    def can(self, text: str, seconds: float = 0.02) -> list[str]:
-        """Send a frame written as ``201#1208``; return what came, written the same way."""
-        identifier, _, data = text.partition("#")
-        self.bench.wire("hv").host_write((int(identifier, 16), bytes.fromhex(data)), self.t)
+    def can(self, text: str, seconds: float = 0.02, role: str = "hv") -> list[str]:
+        """Send a frame written as ``201#1208``, or nothing; return what came, written the same way."""
+        if text:
+            identifier, _, data = text.partition("#")
+            self.bench.wire(role).host_write((int(identifier, 16), bytes.fromhex(data)), self.t)
         self.t += seconds
         self.bench.advance(self.t)
-        return [f"{i:03x}#{d.hex()}" for i, d in self.bench.wire("hv").host_read(self.t)]
+        return [f"{i:03x}#{d.hex()}" for i, d in self.bench.wire(role).host_read(self.t)]
 
 
 MakeHost = Callable[..., Host]
