@@ -39,6 +39,7 @@ from rig.log.reader import read_log
 from rig.log.schema import ROLES
 from rig.scene import Scene, load_scene
 from rig.sim.bench import SimulatedBench
+from rig.sim.settings import ForceTruth
 from rig.sim.wire import ByteWire
 from rig.toml_file import validate
 
@@ -341,6 +342,7 @@ def _noise(scene: Scene) -> float:
     """Standard deviation of the noise, mV/V."""
     assert scene.simulation is not None
     truth = scene.simulation.force
+    assert isinstance(truth, ForceTruth)
     return truth.noise_fraction * truth.sensitivity_mV_per_V
 
 
@@ -459,5 +461,5 @@ def _draw(report: Report, path: Path) -> None:
         f"Force at {FORCE_HZ:.0f} Hz, stage at {STAGE_HZ:.0f} Hz, laser at {LASER_HZ:.0f} Hz over serial ports"
     )
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(path, dpi=110)
