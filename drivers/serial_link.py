@@ -31,6 +31,9 @@ if sys.platform == "win32":
         msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
         os.lseek(fd, 0, os.SEEK_SET)
 
+    def _send(port: serial.Serial, data: bytes) -> int:
+        return port.write(data) or 0
+
 else:
     import fcntl
     import termios
@@ -39,6 +42,13 @@ else:
 
     def _lock(fd: int) -> None:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def _send(port: serial.Serial, data: bytes) -> int:
+        # pyserial would call a process that was kept waiting for the processor a port that takes no data.
+        try:
+            return os.write(port.fileno(), data)
+        except BlockingIOError:
+            return 0
 
 
 _UNUSABLE: tuple[type[Exception], ...] = (*_GONE, ValueError, NotImplementedError)
@@ -104,9 +114,8 @@ class SerialLink:
         ``/dev/ttyUSB0``, ``COM3``; the link's own ``name``.
     baud : int
         Bits per second.
-    write_timeout_s : float
-        How long the driver's buffer may stay full before the port counts as lost. A command always fits an empty
-        buffer, so that in order nothing ever waits.
+
+    A command always fits an empty buffer, so a port that does not take all of one at once counts as lost.
 
     ``settings`` says what was set and what the adapter made of it: adapters that collect bytes for up to 16 ms before
     they hand them on are asked not to.
@@ -117,16 +126,15 @@ class SerialLink:
         The port does not exist, is in use, or may not be opened.
     """
 
-    def __init__(self, name: str, port: str, baud: int, *, write_timeout_s: float = 0.05) -> None:
+    def __init__(self, name: str, port: str, baud: int) -> None:
         import serial
 
         self.name = port
         self._label = f"{name} ({port})"
         self._closed = False
-        self._stalled = serial.SerialTimeoutException
         self._lock = PortLock(self._label, port)
         try:
-            self._serial = serial.Serial(port, baud, timeout=0, write_timeout=write_timeout_s, exclusive=True)
+            self._serial = serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True)
         except _UNUSABLE as error:
             self._lock.release()
             raise _not_opened(self._label, port, error) from None
@@ -146,15 +154,15 @@ class SerialLink:
     def write(self, data: bytes) -> None:
         try:
             self._check_open()
-            self._serial.write(data)
-        except self._stalled:
+            sent = _send(self._serial, data)
+        except _GONE as error:
+            raise self._lost("writing", error) from None
+        if sent < len(data):
             raise DeviceLost(
                 self._label,
                 "the port takes no more data",
                 "The adapter or the device hangs: unplug it and plug it in again.",
-            ) from None
-        except _GONE as error:
-            raise self._lost("writing", error) from None
+            )
 
     def fileno(self) -> int:
         """File descriptor to wait on with ``select``, on systems where serial ports have one."""

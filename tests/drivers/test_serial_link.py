@@ -114,8 +114,8 @@ def test_bytes_that_arrived_before_it_was_unplugged_do_no_harm(link: SerialLink,
 class Broken:
     """A port that breaks at one chosen call, in each of the ways that pyserial lets through."""
 
-    def __init__(self, where: str, error: Exception) -> None:
-        self._where, self._error = where, error
+    def __init__(self, where: str, error: Exception, descriptor: int) -> None:
+        self._where, self._error, self._descriptor = where, error, descriptor
 
     def _break(self, where: str) -> None:
         if where == self._where:
@@ -130,9 +130,10 @@ class Broken:
         self._break("read")
         return b"abc"
 
-    def write(self, data: bytes) -> int:
+    def fileno(self) -> int:
+        """Asked for on the way to a write."""
         self._break("write")
-        return len(data)
+        return self._descriptor
 
     def close(self) -> None:
         self._break("close")
@@ -151,7 +152,7 @@ class Broken:
     ids=lambda error: type(error).__name__,
 )
 def test_every_way_to_vanish_at_every_call(link: SerialLink, where: str, error: Exception) -> None:
-    broken: Any = Broken(where, error)
+    broken: Any = Broken(where, error, link.fileno())
     real, link._serial = link._serial, broken
     try:
         with pytest.raises(DeviceLost):
@@ -165,7 +166,7 @@ def test_every_way_to_vanish_at_every_call(link: SerialLink, where: str, error: 
 def test_close_of_a_vanished_port_is_quiet_and_releases_the_lock(
     link: SerialLink, other_end: Pty, error: Exception
 ) -> None:
-    broken: Any = Broken("close", error)
+    broken: Any = Broken("close", error, link.fileno())
     real, link._serial = link._serial, broken
     link.close()
     real.close()
