@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,20 @@ Settle = Callable[[Problem, Grid, State, float], Iterate]
 def first_modes(span: float, tolerance: float) -> int:
     """Modes that bring the truncation error near ``tolerance`` for ``ln(b/a) = span``: a start, not a promise."""
     return min(FIRST_MODES, max(2, math.ceil(-0.4 - math.log10(tolerance) * (0.25 + 0.12 * span))))
+
+
+def goal(tolerance: float) -> float:
+    """Change of a slope at which Newton's error is half the tolerance."""
+    return min(0.03, max(1e-6, math.sqrt(0.5 * tolerance / NEWTON_FACTOR)))
+
+
+Number = TypeVar("Number", float, Array)
+
+
+def estimate(lam: Number, previous: Number, change: Number, tail: Number, tolerance: float) -> Number:
+    """Estimated relative error of ``lam``, after ``previous`` on the rung below; nan when there is none."""
+    rung = RUNG_FACTOR * abs((lam - previous) / lam)
+    return rung + NEWTON_FACTOR * change**2 + tail + (ROUND_OFF + LEAST_SHARE * tolerance)
 
 
 def next_modes(modes: int) -> int:
@@ -191,18 +206,16 @@ def climb(
     total = np.zeros(len(index), dtype=np.intp)
     answers: list[Answer] = []
     lost: list[NDArray[np.intp]] = []
-    goal = min(0.03, max(1e-6, math.sqrt(0.5 * tolerance / NEWTON_FACTOR)))
+    aim = goal(tolerance)
     previous: Array | None = None
     while True:
-        result = settle(problem, start.grid, start.state, goal)
+        result = settle(problem, start.grid, start.state, aim)
         start = Start(result.grid, result.state)
         total[index] += result.steps
         lam, ok = result.lam, result.ok
         modes = start.grid.table.modes
         if previous is not None:
-            error = RUNG_FACTOR * np.abs(lam - previous) / np.abs(lam) + NEWTON_FACTOR * result.change**2
-            error += result.tail
-            error += ROUND_OFF + LEAST_SHARE * tolerance
+            error = estimate(lam, previous, result.change, result.tail, tolerance)
             settled = np.flatnonzero(ok & (error <= tolerance))
             if len(settled):
                 part = (problem, start, lam)

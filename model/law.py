@@ -41,16 +41,14 @@ class Film:
     alpha: Array
     field: Array | None
     count: Evaluations
+    _weights: Array | None = None  # (2, terms): mu and mu alpha, when shared
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Film:
         """The states at ``index``."""
-        shared = self.mu.shape[1] == 1
-        return Film(
-            mu=self.mu if shared else self.mu[:, index],
-            alpha=self.alpha if shared else self.alpha[:, index],
-            field=None if self.field is None else self.field[index],
-            count=self.count,
-        )
+        field = None if self.field is None else self.field[index]
+        if self.mu.shape[1] == 1:
+            return Film(self.mu, self.alpha, field, self.count, self._weights)
+        return Film(self.mu[:, index], self.alpha[:, index], field, self.count)
 
     def powers(self, log_stretch: Array) -> Array:
         """``exp(al_n X) - 1`` of every term, (terms, 3, ..., S), where ``log_stretch`` stacks L1, L2, -(L1+L2)."""
@@ -61,17 +59,19 @@ class Film:
     def sums(self, powers: Array) -> tuple[Array, Array]:
         """``sum mu_n (l^al_n - 1)`` and ``sum mu_n al_n l^al_n`` of L1, L2, -(L1+L2), each (3, ..., S)."""
         self.count.mechanical += powers[0, 0].size
-        stiffness = self.mu * self.alpha
         if self.mu.shape[1] == 1:
-            flat = powers.reshape(powers.shape[0], -1)
-            both = (np.hstack((self.mu, stiffness)).T @ flat).reshape((2, *powers.shape[1:]))
+            if self._weights is None:
+                self._weights = np.stack((self.mu[:, 0], self.mu[:, 0] * self.alpha[:, 0]))
+            both = (self._weights @ powers.reshape(len(powers), -1)).reshape((2, *powers.shape[1:]))
             stress, modulus = both[0], both[1]
         else:
             stress = self.mu[0] * powers[0]
-            modulus = stiffness[0] * powers[0]
+            modulus = self.alpha[0] * stress
             for n in range(1, powers.shape[0]):
-                stress += self.mu[n] * powers[n]
-                modulus += stiffness[n] * powers[n]
+                term = self.mu[n] * powers[n]
+                stress += term
+                term *= self.alpha[n]
+                modulus += term
         modulus += 2.0  # sum mu_n al_n = 2 G, the unit of stress
         return stress, modulus
 

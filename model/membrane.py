@@ -11,15 +11,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import ritz, tension_field, trace
+from model import ritz, single, tension_field, trace
 from model.ladder import Answer, Start, climb, first_modes
 from model.law import Array, Evaluations, Film, stack, stress
 from model.profile import Profile, profile
-from model.ritz import LONGEST, Grid, Problem
+from model.ritz import LONGEST, Grid, Problem, State
 from model.specimen import Specimen
 
 Wrinkling = Literal["plain", "tension_field"]
-BLOCK = 512  # states solved together: their arrays stay in the processor's cache
+BLOCK = 1024  # states solved together: their arrays stay in the processor's cache
 # Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
 # followed from rest.
 SOFTENING = 0.25
@@ -129,7 +129,8 @@ class Solution:
     stretch_exceeded: bool
     dforce: dict[str, Any] | None = None
     evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
-    kept: tuple[Problem, Answer] | None = field(default=None, repr=False, compare=False)
+    kept: tuple[Problem, Grid, State, Array] | None = field(default=None, repr=False, compare=False)
+    quick: single.Found | None = field(default=None, repr=False, compare=False)
 
     @property
     def answered(self) -> bool:
@@ -148,15 +149,17 @@ class Solution:
         ------
         ValueError : the state has no answer
         """
-        if self.kept is None:
+        kept = self.kept
+        if self.quick is not None:
+            inputs = _Inputs.gather(self.specimen, self.h, self.voltage)
+            problem = _Block(inputs, np.zeros(1, dtype=np.intp), self.evaluations).problem
+            state = State(np.array(self.quick.c)[:, None], np.array(self.quick.w)[:, None, None])
+            kept = problem, Grid.lay(self.quick.modes, problem.cut()), state, np.array([self.quick.lam])
+        if kept is None:
             raise ValueError(f"no profile: {self.status.message}")
-        problem, answer = self.kept
         s = self.specimen
         found = profile(
-            problem,
-            answer.grid,
-            answer.state,
-            answer.lam,
+            *kept,
             points,
             ring=s.ring_radius,
             shear=s.material.shear_modulus,
@@ -242,14 +245,63 @@ def solve_many(
     return _solve(_Inputs.gather(specimen, h, voltage), tolerance, wrinkling, sensitivities)[0]
 
 
-def _solve(
-    inputs: _Inputs, tolerance: float, wrinkling: Wrinkling, sensitivities: bool
-) -> tuple[Solutions, tuple[Problem, Answer] | None]:
-    """The solutions, and the last answer with its problem."""
+def _check(tolerance: float, wrinkling: str) -> None:
     if not 1e-12 <= tolerance <= 1e-2:
         raise ValueError(f"tolerance = {tolerance!r}: allowed are 1e-12 to 1e-2")
     if wrinkling not in ("plain", "tension_field"):
         raise ValueError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
+
+
+def _quick(specimen: Specimen, h: float, voltage: float, tolerance: float, wrinkling: Wrinkling) -> Solution | None:
+    """An easy state, solved without arrays; None when it is not one."""
+    m, t, b, lp = specimen.material, specimen.thickness, specimen.ring_radius, specimen.prestretch
+    if h == 0.0 or not (math.isfinite(h) and math.isfinite(voltage)) or tolerance < 1e-11:
+        return None
+    shear = m.shear_modulus
+    film = single.Film(
+        terms=tuple((mu / shear, alpha, mu / shear * alpha) for mu, alpha in zip(m.mu, m.alpha, strict=True)),
+        field=m.permittivity * (voltage / t) ** 2 / shear,
+        log_prestretch=math.log(lp),
+        span=math.log(b / specimen.disk_radius),
+        height=abs(h) / b,
+    )
+    count = Evaluations()
+    found = single.solve(film, tolerance, count)
+    if found is None or found.softening > SOFTENING or found.meridional <= 0.0:
+        return None
+    wrinkled = found.hoop < FLAT
+    # Beyond loss of tension slack must be ruled out, and folds may be asked for.
+    if wrinkled:
+        return None
+    force = 2.0 * math.pi * b * t * shear / lp**2 * found.lam
+    peak, stretch = abs(voltage) / t * math.exp(found.log_area), math.exp(found.log_stretch)
+    return Solution(
+        specimen=specimen,
+        h=h,
+        voltage=voltage,
+        force=math.copysign(force, h),
+        peak_field=peak,
+        peak_field_radius=b * found.radius,
+        min_hoop_stress=shear * found.hoop,
+        min_meridional_stress=shear * found.meridional,
+        max_stretch=stretch,
+        status=Status.TAUT,
+        error_estimate=found.error,
+        iterations=found.steps,
+        modes=found.modes,
+        stable=True,
+        field_exceeded=m.breakdown_field is not None and peak > m.breakdown_field,
+        stretch_exceeded=m.max_stretch is not None and stretch > m.max_stretch,
+        evaluations=count,
+        quick=found,
+    )
+
+
+def _solve(
+    inputs: _Inputs, tolerance: float, wrinkling: Wrinkling, sensitivities: bool
+) -> tuple[Solutions, tuple[Problem, Grid, State, Array] | None]:
+    """The solutions, and the last answer with its problem."""
+    _check(tolerance, wrinkling)
     result = _Flat(len(inputs.h), max((len(s.material.mu) for s in inputs.specimens), default=1), sensitivities)
     count = Evaluations()
     with np.errstate(all="ignore"):
@@ -268,6 +320,11 @@ def solve(
     sensitivities: bool = False,
 ) -> Solution:
     """Solve one state: `solve_many` for scalars, with the profiles at hand."""
+    _check(tolerance, wrinkling)
+    if not sensitivities:
+        quick = _quick(specimen, float(h), float(voltage), tolerance, wrinkling)
+        if quick is not None:
+            return quick
     many, kept = _solve(_Inputs.gather(specimen, float(h), float(voltage)), tolerance, wrinkling, sensitivities)
     return Solution(
         specimen=specimen,
@@ -316,7 +373,7 @@ class _Flat:
         }
         self.status = np.full(states, Status.INVALID, dtype=np.int8)
         self.dforce: dict[str, Array] | None = None
-        self.kept: tuple[Problem, Answer] | None = None
+        self.kept: tuple[Problem, Grid, State, Array] | None = None
         if sensitivities:
             names = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
             self.dforce = {name: np.full(states, np.nan) for name in names}
@@ -462,7 +519,7 @@ class _Block:
                 return
             answer = answer.take(these)
         where = index[answer.index]
-        result.kept = (self.problem.take(where), answer)
+        result.kept = (self.problem.take(where), answer.grid, answer.state, answer.lam)
         to = self.index[where]
         h, v, t, shear, lp, b = (x[where] for x in (self.h, self.voltage, self.t, self.shear, self.lp, self.b))
         sign = np.sign(h)

@@ -28,6 +28,16 @@ class Extremes:
         return Extremes(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
+@lru_cache(maxsize=64)
+def edge_tests(modes: int) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Test functions at the points, and their derivatives: 1 at the disk, then 1 at the ring, 0 at the other end."""
+    xi = table(modes).xi
+    power = modes + 1
+    fall, rise = 0.5 * (1.0 - xi), 0.5 * (1.0 + xi)
+    half = 0.5 * power
+    return (fall**power, -half * fall ** (power - 1)), (rise**power, half * rise ** (power - 1))
+
+
 @dataclass(slots=True)
 class Edges:
     """The state at disk and ring, (2, S) each."""
@@ -46,19 +56,15 @@ def edges(problem: Problem, grid: Grid, state: State, at: Points, lam: Array) ->
     shape's squared, as the force has; values extrapolated from the points would not.
     """
     t = grid.table
-    power = t.modes + 1
-    half = 0.5 * (1.0 - t.xi)
     law = at.law
-    reaction = []
-    for element, fall, rise in ((0, half, -1.0), (-1, 1.0 - half, 1.0)):
-        on_q = grid.twice[:, element] * law.t1[:, element] * at.along[:, element]
-        both = grid.twice[:, element] * law.t2[:, element] * at.around[:, element] + on_q
-        slope = 0.5 * power * rise * fall ** (power - 1)
-        reaction.append(fall**power @ both + (slope @ on_q) * grid.dxi[element])
+    on_q = grid.twice * (law.t1 * at.along)
+    both = grid.twice * (law.t2 * at.around)
+    both += on_q
+    (disk, disk_slope), (ring, ring_slope) = edge_tests(t.modes)
     inner = np.exp(-problem.span)
-    pull = np.hypot(
-        np.stack((-reaction[0] / (inner * inner), reaction[1])), np.stack((lam / inner, lam))
-    )  # sigma1 lp/l1: the nominal stress, in units of G/lp
+    pull = np.empty((2, len(lam)))  # sigma1 lp/l1: the nominal stress, in units of G/lp
+    pull[0] = np.hypot(disk @ both[:, 0] + (disk_slope @ on_q[:, 0]) * grid.dxi[0], lam * inner) / (inner * inner)
+    pull[1] = np.hypot(ring @ both[:, -1] + (ring_slope @ on_q[:, -1]) * grid.dxi[-1], lam)
     log1 = np.stack((t.ends[0] @ at.log[0][:, 0], t.ends[1] @ at.log[0][:, -1]))
     log2 = np.broadcast_to(problem.log_prestretch, log1.shape)
     wrinkled = None
@@ -88,55 +94,65 @@ def edges(problem: Problem, grid: Grid, state: State, at: Points, lam: Array) ->
 
 
 @lru_cache(maxsize=64)
-def _fine(modes: int) -> Array:
+def fine_table(modes: int) -> Array:
     """Interpolation from the points to `FINE` points over the element, ends included."""
     return barycentric(table(modes).xi, -np.cos(np.linspace(0.0, np.pi, FINE)))
 
 
 def _largest(grid: Grid, values: Array, ends: Array) -> tuple[Array, Array]:
-    """Largest value over the film and R/b where it is, from values at the points (Q, M, S) and both edges (2, S)."""
-    states = values.shape[2]
-    columns = np.arange(states)
-    edge = ends.argmax(axis=0)
-    best = ends[edge, columns]
-    radius = np.exp(grid.breaks[0]) ** (1 - edge)
-    inside = np.flatnonzero(values.max(axis=(0, 1)) > best)
-    if len(inside):
-        fine = np.einsum("fq,qms->mfs", _fine(grid.table.modes), values[..., inside])
-        flat = fine.reshape(-1, len(inside))
-        top = flat.argmax(axis=0)
+    """Largest values over the film, (K, S), from those at the points (K, Q, M, S) and at both edges (K, 2, S).
+
+    Also R/b where each stands.
+    """
+    best = ends.max(axis=1)
+    radius = np.where(ends[:, 0] >= ends[:, 1], np.exp(grid.breaks[0]), 1.0)
+    kind, state = np.nonzero(values.max(axis=(1, 2)) > best)
+    if len(state):
+        fine = np.einsum("fq,nqm->nmf", fine_table(grid.table.modes), values[kind, :, :, state])
+        flat = fine.reshape(len(state), -1)
+        top = flat.argmax(axis=1)
         element, place = np.divmod(top, FINE)
         place = np.clip(place, 1, FINE - 2)
-        some = np.arange(len(inside))
-        low, mid, high = (fine[element, place + k, some] for k in (-1, 0, 1))
+        some = np.arange(len(state))
+        low, mid, high = (fine[some, element, place + k] for k in (-1, 0, 1))
         curve = low - 2.0 * mid + high
         shift = np.where(curve < 0.0, np.clip(0.5 * (low - high) / curve, -1.0, 1.0), 0.0)
-        peak = np.maximum(flat[top, some], mid - 0.25 * (low - high) * shift)
-        better = peak > best[inside]
+        peak = np.maximum(flat[some, top], mid - 0.25 * (low - high) * shift)
+        better = peak > best[kind, state]
         # The points are equidistant in the angle, so the parabola is laid in the angle too.
         angle = (place + shift) * (np.pi / (FINE - 1))
-        x0, x1 = grid.breaks[element, inside], grid.breaks[element + 1, inside]
+        x0, x1 = grid.breaks[element, state], grid.breaks[element + 1, state]
         at = np.exp(x0 + 0.5 * (1.0 - np.cos(angle)) * (x1 - x0))
-        best[inside] = np.where(better, peak, best[inside])
-        radius[inside] = np.where(better, at, radius[inside])
+        best[kind, state] = np.where(better, peak, best[kind, state])
+        radius[kind, state] = np.where(better, at, radius[kind, state])
     return best, radius
 
 
 def extremes(problem: Problem, grid: Grid, state: State, at: Points, lam: Array) -> Extremes:
     """Extremes over the points, between them, and at both edges."""
     edge = edges(problem, grid, state, at, lam)
-    law = at.law
-    area, radius = _largest(grid, -at.log[2], edge.log1 + edge.log2)
+    law, log = at.law, at.log
+    values = np.empty((5, *log.shape[1:]))
+    ends = np.empty((5, 2, len(lam)))
+    np.negative(log[2], out=values[0])
+    np.add(edge.log1, edge.log2, out=ends[0])
+    np.negative(law.t2, out=values[1])
+    np.negative(edge.t2, out=ends[1])
+    np.negative(law.t1, out=values[2])
+    np.negative(edge.t1, out=ends[2])
+    values[3:] = log[:2]
+    ends[3], ends[4] = edge.log1, edge.log2
+    best, radius = _largest(grid, values, ends)
     if law.maxwell is None:
         softening = np.zeros(len(lam))
     else:
         softening = (2.0 * law.maxwell / (law.h11 + 2.0 * law.maxwell)).max(axis=(0, 1))
     return Extremes(
-        log_area=area,
-        radius=radius,
-        hoop=-_largest(grid, -law.t2, -edge.t2)[0],
-        meridional=-_largest(grid, -law.t1, -edge.t1)[0],
-        log_stretch=np.maximum(_largest(grid, at.log[0], edge.log1)[0], _largest(grid, at.log[1], edge.log2)[0]),
+        log_area=best[0],
+        radius=radius[0],
+        hoop=-best[1],
+        meridional=-best[2],
+        log_stretch=np.maximum(best[3], best[4]),
         softening=softening,
     )
 

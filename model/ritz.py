@@ -371,35 +371,22 @@ def reduce(problem: Problem, grid: Grid, w: Array, at: Points) -> Reduced:
     return Reduced(matrix, residual, coupling, give, lam0, hw, kqw, kew, gw, kww.min(axis=(0, 1)) > 0.0)
 
 
-FEW = 8  # below this many states one LAPACK call a state beats elimination vectorised over the states
+FEW = 8  # below this many states elimination is not vectorised over the states
+SMALL = 8  # below this many unknowns a loop over Python floats beats LAPACK's call
 
 
-def factor_solve(matrix: Array, rhs: list[Array]) -> tuple[list[Array], NDArray[np.bool_]]:
-    """Solve symmetric systems (n, n, S) for right-hand sides (n, S); tell which matrices are positive definite.
+def factor_solve(matrix: Array, rhs: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Solve symmetric systems (n, n, S) for right-hand sides (n, k, S); tell which matrices are positive definite.
 
-    A matrix that is not positive definite gets a solution all the same when it is regular; nan when it is not.
+    Elimination without pivoting, which is stable for those; another matrix gets what it gets.
     """
     n, _, states = matrix.shape
     if states < FEW:
-        columns = np.stack(rhs, axis=1)
-        x = np.full(columns.shape, np.nan)
-        positive = np.zeros(states, dtype=bool)
-        for s in range(states):
-            a = matrix[:, :, s]
-            try:
-                lower = np.linalg.cholesky(a)
-            except np.linalg.LinAlgError:
-                try:
-                    x[:, :, s] = np.linalg.solve(a, columns[:, :, s])
-                except np.linalg.LinAlgError:
-                    continue
-            else:
-                inverse = np.linalg.inv(lower)
-                x[:, :, s] = inverse.T @ (inverse @ columns[:, :, s])
-                positive[s] = True
-        return [x[:, i] for i in range(len(rhs))], positive
-    a = np.concatenate((matrix, np.stack(rhs, axis=1)), axis=1)
-    positive = np.ones(states, dtype=bool)
+        few = _solve_small if n <= SMALL else _solve_large
+        solved = [few(matrix[:, :, s], rhs[:, :, s]) for s in range(states)]
+        return np.stack([x for x, _ in solved], axis=2), np.array([positive for _, positive in solved])
+    a = np.concatenate((matrix, rhs), axis=1)
+    positive = np.ones(states, dtype=np.bool_)
     for k in range(n):
         pivot = a[k, k]
         positive &= pivot > 0.0
@@ -409,15 +396,51 @@ def factor_solve(matrix: Array, rhs: list[Array]) -> tuple[list[Array], NDArray[
     x = a[:, n:]
     for k in range(n - 2, -1, -1):
         x[k] -= (a[k, k + 1 : n, None] * x[k + 1 :]).sum(axis=0)
-    return [x[:, i] for i in range(len(rhs))], positive
+    return x, positive
+
+
+def _solve_small(matrix: Array, rhs: Array) -> tuple[Array, bool]:
+    n = len(matrix)
+    rows = [row + right for row, right in zip(matrix.tolist(), rhs.tolist(), strict=True)]
+    positive = True
+    for k, row in enumerate(rows):
+        pivot = row[k]
+        positive = positive and pivot > 0.0
+        if pivot == 0.0:
+            return np.full(rhs.shape, np.nan), False
+        for i in range(k + 1, n):
+            other = rows[i]
+            factor = other[k] / pivot
+            for j in range(k + 1, len(row)):
+                other[j] -= factor * row[j]
+    for k in range(n - 1, -1, -1):
+        row = rows[k]
+        for j in range(n, len(row)):
+            total = row[j]
+            for i in range(k + 1, n):
+                total -= row[i] * rows[i][j]
+            row[j] = total / row[k]
+    return np.array([row[n:] for row in rows]), positive
+
+
+def _solve_large(matrix: Array, rhs: Array) -> tuple[Array, bool]:
+    try:
+        inverse = np.linalg.inv(np.linalg.cholesky(matrix))
+    except np.linalg.LinAlgError:
+        try:
+            return np.linalg.solve(matrix, rhs).astype(np.float64, copy=False), False
+        except np.linalg.LinAlgError:
+            return np.full(rhs.shape, np.nan), False
+    x: Array = inverse.T @ (inverse @ rhs)
+    return x, True
 
 
 def newton(problem: Problem, grid: Grid, state: State, at: Points, *, tangent: bool = False) -> Step:
     """The Newton step at ``state``; with ``tangent`` also the derivative of the state with respect to h/b."""
     system = reduce(problem, grid, state.w, at)
-    rhs = [system.rhs]
+    rhs = system.rhs[:, None]
     if tangent:
-        rhs.append(-system.coupling / system.give)
+        rhs = np.stack((system.rhs, -system.coupling / system.give), axis=1)
     solutions, positive = factor_solve(system.matrix, rhs)
 
     def slopes(dc: Array, lam: Array, gradient: Array | float) -> Array:
@@ -431,12 +454,12 @@ def newton(problem: Problem, grid: Grid, state: State, at: Points, *, tangent: b
         out *= system.hw
         return out
 
-    dc = solutions[0]
+    dc = solutions[:, 0]
     lam = system.lam0 + (system.coupling * dc).sum(axis=0) / system.give
     diagonal = np.einsum("iis->is", system.matrix)
     step = Step(dc, slopes(dc, lam, system.gw), lam, positive & system.positive, diagonal)
     if tangent:
-        tc = solutions[1]
+        tc = solutions[:, 1]
         stiffness = (1.0 + (system.coupling * tc).sum(axis=0)) / system.give
         step.tangent = (tc, slopes(tc, stiffness, 0.0), stiffness)
     return step

@@ -293,3 +293,24 @@ def test_profile_obeys_the_equations(specimen: Specimen, h: float, v: float, wri
 def test_no_profile_without_an_answer() -> None:
     with pytest.raises(ValueError, match="slack"):
         solve(film(4, 1.0), 1e-3, 2500.0).profile()
+
+
+def test_the_path_for_one_state_has_the_digits_of_the_path_for_many() -> None:
+    """A single taut state is solved without arrays, by the same steps: every result must be the same."""
+    films = [film(a, lp) for a in (1.0, 4.0, 12.0) for lp in (1.0, 1.3)] + [film(6.0, 1.5, NAMED["treloar-ogden1972"])]
+    names = ("force", "peak_field", "peak_field_radius", "min_hoop_stress", "min_meridional_stress", "max_stretch")
+    compared = 0
+    for specimen in films:
+        for h, v in ((1e-3, 0.0), (8e-3, 0.0), (-8e-3, 400.0), (30e-3, 600.0)):
+            for tolerance in (1e-5, 1e-8, 1e-10):
+                one = solve(specimen, h, v, tolerance=tolerance)
+                many = solve_many(specimen, [h], v, tolerance=tolerance)
+                assert one.status == many.status[0]
+                if one.quick is None:
+                    continue
+                compared += 1
+                assert (one.iterations, one.modes) == (many.iterations[0], many.modes[0])
+                assert one.error_estimate == pytest.approx(many.error_estimate[0], rel=1e-3)
+                for name in names:
+                    assert getattr(one, name) == pytest.approx(getattr(many, name)[0], rel=1e-9, abs=1e-6), name
+    assert compared > 60
