@@ -64,11 +64,35 @@ def intervals(
             room = COST_95 - (cost - least) / misfit
             if room > 0.0:
                 value, gradient = target(at)
-                response = Covariance(problem, at, free).response
-                half = math.sqrt(room * misfit) * float(np.linalg.norm(gradient @ response))
-                reached += [value - half, value + half]
+                for side in (-1.0, 1.0):
+                    reached.append(value + side * _half(problem, at, free, bounds, gradient * side, room * misfit))
         ends[name] = [min(reached), max(reached)]
     return {name: (low, high) for name, (low, high) in ends.items()}
+
+
+def _half(
+    problem: Problem,
+    at: Array,
+    free: NDArray[np.bool_],
+    bounds: tuple[Array, Array],
+    gradient: Array,
+    room: float,
+) -> float:
+    """How far a quantity can rise before chi-square has risen by ``room``; no share leaves its bounds on the way."""
+    n = problem.terms
+    for _ in range(n + 1):
+        response = Covariance(problem, at, free).response
+        rows = gradient @ response
+        deviation = float(np.linalg.norm(rows))
+        if deviation == 0.0:
+            return 0.0
+        end = at + math.sqrt(room) / deviation * (response @ rows)
+        outside = free[:n] & ((end[:n] < bounds[0][:n]) | (end[:n] > bounds[1][:n]))
+        if not outside.any():
+            return math.sqrt(room) * deviation
+        free = free.copy()
+        free[:n] &= ~outside
+    return 0.0
 
 
 def _steps(

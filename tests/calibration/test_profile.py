@@ -38,8 +38,8 @@ def test_one_term_is_linear_and_its_intervals_are_symmetric(experiment: Experime
 def test_ends_of_the_intervals_of_two_terms_against_brute_force(experiment: Experiment) -> None:
     """Pin G at either end and minimise from many random starts: chi-square must rise by 3.84.
 
-    Without systematic errors the stated interval is the profile's own. One number in ten is what the conditional
-    linearisation and a search that ends in a flat valley may cost.
+    Without systematic errors the stated interval is the profile's own. The conditional linearisation may make it wider
+    by a sixth of its half-width; narrower than the truth by more than 5 % would be a false promise.
     """
     curves = experiment(seed=116, samples=600, errors={})
     found = identify(curves, terms=2, profiles=True)
@@ -74,4 +74,4 @@ def test_ends_of_the_intervals_of_two_terms_against_brute_force(experiment: Expe
     stiff = 1e-3 * (high - low) / 4.0
     for end in (low, high):
         rise = least(lambda x, end=end: ((target(x)[0] - end) / stiff, target(x)[1] / stiff)) - free
-        assert math.sqrt(rise) == pytest.approx(math.sqrt(COST_95), rel=0.1)
+        assert 0.95 < math.sqrt(rise / COST_95) < 1.17
