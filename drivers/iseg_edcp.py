@@ -372,6 +372,8 @@ class IsegEDCP:
         Fastest voltage ramp that the module accepts, in percent of its nominal voltage per second.
     """
 
+    measures_current = True
+
     def __init__(
         self,
         name: str,

@@ -75,7 +75,10 @@ class DisplacementSample:
 
 @dataclass(frozen=True, slots=True)
 class HVSample:
-    """Measured voltage and current of the output, with the set-point read back from the device."""
+    """Measured voltage and current of the output, with the set-point read back from the device.
+
+    The current is NaN when there is no value, and always where the supply does not measure it.
+    """
 
     t: float
     voltage: float
@@ -166,7 +169,12 @@ class HVSupply(Device, Protocol):
     """One channel of a high-voltage supply. Constructing and polling it changes no output.
 
     Every write is read back; a set-point that does not come back as written raises `DeviceRefused`.
+
+    ``measures_current`` says whether it measures its output current and can limit it. Where it does not, every sample's
+    current is NaN and `set_current_limit` raises `DeviceRefused`.
     """
+
+    measures_current: bool
 
     @property
     def nominal(self) -> tuple[float, float]:

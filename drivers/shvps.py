@@ -100,6 +100,8 @@ class Shvps:
         Ramp until `set_ramp` says otherwise.
     """
 
+    measures_current = False
+
     def __init__(
         self,
         name: str,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 from drivers.link import ByteLink, CanFrame, FrameLink
 from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Stage
 from rig.clock import Clock, RealClock, VirtualClock
-from rig.scene import GSV8Table, IsegTable, KeyenceTable, Scene, ZaberTable
+from rig.scene import CanTable, CiA404Table, GSV8Table, IsegTable, KeyenceTable, Scene, ShvpsTable, ZaberTable
 
 if TYPE_CHECKING:
     from rig.sim.bench import SimulatedBench
@@ -107,7 +107,7 @@ class Bench:
     def _open_ports(self) -> None:
         self.clock = RealClock()
         for role, table in self.scene.instruments.items():
-            if isinstance(table, IsegTable):
+            if isinstance(table, CanTable):
                 from drivers.can_link import CanLink
 
                 assert table.interface is not None and table.can_channel is not None
@@ -139,6 +139,7 @@ class Bench:
         self.displacement = None
         self.hv = None
         bytes_of: Callable[[str], ByteLink] = lambda role: TappedByteLink(role, self._byte_links[role], tap)  # noqa: E731
+        frames_of: Callable[[str], FrameLink] = lambda role: TappedFrameLink(role, self._frame_links[role], tap)  # noqa: E731
         for role, table in self.scene.instruments.items():
             match table:
                 case ZaberTable():
@@ -160,6 +161,20 @@ class Bench:
                         role, bytes_of(role), channel=table.channel, rate_Hz=table.rate_Hz, timeout_s=table.timeout_s
                     )
                     self.devices[role] = self.force
+                case CiA404Table():
+                    from drivers.cia404 import CiA404
+
+                    self.force = CiA404(
+                        role,
+                        frames_of(role),
+                        node=table.node,
+                        channel=table.channel,
+                        rate_Hz=table.rate_Hz,
+                        timeout_s=table.timeout_s,
+                        unit=table.unit,
+                        factor=table.factor,
+                    )
+                    self.devices[role] = self.force
                 case KeyenceTable():
                     from drivers.keyence_lkg import KeyenceLKG
 
@@ -176,11 +191,22 @@ class Bench:
 
                     self.hv = IsegEDCP(
                         role,
-                        TappedFrameLink(role, self._frame_links[role], tap),
+                        frames_of(role),
                         module=table.module,
                         channel=table.channel,
                         poll_rate_Hz=table.poll_rate_Hz,
                         timeout_s=table.timeout_s,
+                    )
+                    self.devices[role] = self.hv
+                case ShvpsTable():
+                    from drivers.shvps import Shvps
+
+                    self.hv = Shvps(
+                        role,
+                        bytes_of(role),
+                        poll_rate_Hz=table.poll_rate_Hz,
+                        timeout_s=table.timeout_s,
+                        ramp_V_per_s=table.ramp_V_per_s,
                     )
                     self.devices[role] = self.hv
 

@@ -174,6 +174,8 @@ class Engine:
                 ramp = self.bench.scene.hv.ramp_V_per_s if self.bench.scene.hv is not None else 0.0
                 tell = lambda command, argument: self.command("hv", command, argument)  # noqa: E731
                 self._guard = Guard(self.bench.hv, self.limits, self.film, ramp, tell)
+                if not self.bench.hv.measures_current:
+                    self.recorder.event("warning", "hv", "this supply does not measure its current: nothing watches it")
             self._set_up()
             self._watching = True
             self._carry_out_all()
@@ -247,14 +249,17 @@ class Engine:
         """One turn of the loop: poll, judge, write, wait."""
         if self._stop.count:
             raise Stopped(f"stopped by {self._stop.source}")
-        now = self.clock.now()
+        began = self.clock.now()
         for role, device in self.bench.devices.items():
+            # Each device its own time: data must never seem to have come before they were sent.
+            now = self.clock.now()
             for sample in device.poll(now):
                 self._take(role, sample, now)
+        now = self.clock.now()
         if self._watching:
             self._watch(now)
         self.recorder.tick(now)
-        self.clock.sleep_until(self._next_turn(now))
+        self.clock.sleep_until(self._next_turn(began))
 
     def _next_turn(self, now: float) -> float:
         wanted = min(device.next_poll for device in self.bench.devices.values())
@@ -360,7 +365,7 @@ class Engine:
                 guard.kill(f"{cause}; hastened")
             for role, device in self.bench.devices.items():
                 if role not in lost:
-                    self._poll_to_the_end(role, device.poll, now, lost)
+                    self._poll_to_the_end(role, device.poll, self.clock.now(), lost)
             still = "stage" in lost or not self.bench.stage.moving
             off = guard is None or guard.output_is_safe or "hv" in lost
             if still and off:

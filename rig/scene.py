@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from model.materials import NAMED, Material
 from model.specimen import Specimen
 from rig.errors import ConfigError
-from rig.sim.settings import SimulationSettings
+from rig.sim.settings import TWINS, SimulationSettings
 from rig.table import Table
 from rig.toml_file import load_table, validate
 
@@ -141,17 +141,22 @@ class KeyenceTable(SerialTable):
     poll_rate_Hz: float = Field(default=50.0, gt=0, le=200)
 
 
-class IsegTable(Table):
-    """One channel of an iseg supply that speaks EDCP on CAN."""
+class ShvpsTable(SerialTable):
+    """The shvps supply of dielectric-elastomer labs on a serial port. Whole volts; it does not measure its current."""
 
-    driver: Literal["iseg-edcp"]
+    measures_current: ClassVar[bool] = False
+    driver: Literal["shvps"]
+    baud: int = Field(default=115200, gt=0)
+    ramp_V_per_s: Positive = 100.0
+    poll_rate_Hz: float = Field(default=10.0, gt=0, le=20)
+
+
+class CanTable(Table):
+    """What every instrument on a CAN bus has."""
+
     interface: Literal["slcan", "socketcan", "pcan", "vector", "virtual", "udp_multicast"] | None = None
     can_channel: str | None = None
     bitrate: int = Field(default=125_000, gt=0)
-    module: int = Field(default=0, ge=0, le=63)
-    channel: int = Field(default=0, ge=0, le=23)
-    ramp_V_per_s: Positive = 100.0
-    poll_rate_Hz: float = Field(default=10.0, gt=0, le=50)
     timeout_s: float = Field(default=0.25, gt=0, le=10)
     serial: str | None = None
     certificate: str | None = None
@@ -163,6 +168,41 @@ class IsegTable(Table):
         return self
 
 
+class CiA404Table(CanTable):
+    """A load cell on CANopen by device profile CiA 404; its certificate corrects the newtons that it states."""
+
+    driver: Literal["cia404"]
+    node: int = Field(default=1, ge=1, le=127)
+    channel: int = Field(default=1, ge=1, le=199)
+    rate_Hz: float = Field(default=100.0, gt=0, le=1000)
+    # For a device that states neither newtons nor mV/V: what its values are, once multiplied by the factor.
+    unit: Literal["N", "mV/V"] | None = None
+    factor: float = 1.0
+    certificate: str
+
+    @model_validator(mode="after")
+    def _factor_has_a_unit(self) -> Self:
+        if self.unit is None and self.factor != 1.0:
+            raise ValueError("factor is given without unit: say what the values are, multiplied by it")
+        if self.factor == 0.0:
+            raise ValueError("factor must not be 0")
+        return self
+
+
+class IsegTable(CanTable):
+    """One channel of an iseg supply that speaks EDCP on CAN."""
+
+    measures_current: ClassVar[bool] = True
+    driver: Literal["iseg-edcp"]
+    module: int = Field(default=0, ge=0, le=63)
+    channel: int = Field(default=0, ge=0, le=23)
+    ramp_V_per_s: Positive = 100.0
+    poll_rate_Hz: float = Field(default=10.0, gt=0, le=50)
+
+
+Instrument = ZaberTable | GSV8Table | CiA404Table | KeyenceTable | IsegTable | ShvpsTable
+
+
 class Scene(Table):
     """Everything about the bench for one specimen. See the module's docstring."""
 
@@ -170,10 +210,23 @@ class Scene(Table):
     specimen: SpecimenTable
     limits: LimitsTable
     stage: ZaberTable
-    force: GSV8Table
+    force: Annotated[GSV8Table | CiA404Table, Field(discriminator="driver")]
     displacement: KeyenceTable | None = None
-    hv: IsegTable | None = None
+    hv: Annotated[IsegTable | ShvpsTable, Field(discriminator="driver")] | None = None
     simulation: SimulationSettings | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _simulate_what_is_named(cls, raw: Any) -> Any:
+        """The simulated instruments are those of the scene: their ``driver`` need not be repeated."""
+        if not isinstance(raw, dict) or not isinstance(raw.get("simulation"), dict):
+            return raw
+        simulation = dict(raw["simulation"])
+        for role, drivers in TWINS.items():
+            table, truth = raw.get(role), simulation.get(role, {})
+            if isinstance(table, dict) and isinstance(truth, dict) and table.get("driver") in drivers:
+                simulation[role] = {"driver": table["driver"], **truth}
+        return raw | {"simulation": simulation}
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -183,14 +236,45 @@ class Scene(Table):
             raise ValueError(f"{', '.join(named)} has a port but {', '.join(missing)} has none; name all or none")
         if not named and self.simulation is None:
             raise ValueError("no instrument has a port and there is no [simulation] table: nothing to run on")
-        if self.hv is not None and (self.limits.voltage_V is None or self.limits.current_uA is None):
-            raise ValueError("a scene with [hv] must give limits.voltage_V and limits.current_uA")
+        for role in TWINS:
+            table = self.instruments.get(role)
+            simulated = getattr(self.simulation, role, None)
+            if table is not None and simulated is not None and table.driver != simulated.driver:
+                raise ValueError(
+                    f"{role}.driver is {table.driver!r} but simulation.{role}.driver is {simulated.driver!r}; "
+                    f"leave simulation.{role}.driver out"
+                )
+        self._check_buses()
+        self._check_current_limit()
         if self.hv is None and self.limits.voltage_V is not None:
             raise ValueError("limits.voltage_V is given but there is no [hv] instrument")
         return self
 
+    def _check_buses(self) -> None:
+        on: dict[tuple[str, str], str] = {}
+        for role, table in self.instruments.items():
+            if isinstance(table, CanTable) and table.interface is not None and table.can_channel is not None:
+                other = on.setdefault((table.interface, table.can_channel), role)
+                if other != role:
+                    raise ValueError(
+                        f"{other} and {role} both name the CAN channel {table.can_channel!r}; two instruments on one "
+                        "bus are not supported: give each an adapter of its own"
+                    )
+
+    def _check_current_limit(self) -> None:
+        if self.hv is None:
+            return
+        if self.limits.voltage_V is None or (self.hv.measures_current and self.limits.current_uA is None):
+            wanted = "limits.voltage_V and limits.current_uA" if self.hv.measures_current else "limits.voltage_V"
+            raise ValueError(f"a scene with [hv] must give {wanted}")
+        if not self.hv.measures_current and self.limits.current_uA is not None:
+            raise ValueError(
+                f"limits.current_uA is given, but the {self.hv.driver} supply does not measure its current, so nothing "
+                "could hold it to that limit; leave the limit out and limit the current by hardware"
+            )
+
     @cached_property
-    def instruments(self) -> dict[str, ZaberTable | GSV8Table | KeyenceTable | IsegTable]:
+    def instruments(self) -> dict[str, Instrument]:
         """The instruments that the scene names, by role, in the order in which they are polled."""
         tables = {"stage": self.stage, "force": self.force, "displacement": self.displacement, "hv": self.hv}
         return {role: table for role, table in tables.items() if table is not None}

@@ -128,6 +128,8 @@ _TAGS = {
     "gsv8",
     "keyence-lkg",
     "iseg-edcp",
+    "cia404",
+    "shvps",
     "str",
     "MaterialTable",
 }

@@ -18,7 +18,7 @@ from rig.safety.limits import FilmLimits, Limits
 
 SAFE_VOLTAGE = 60.0  # V; below this the discharge is harmless (EN 50191 names 60 V DC)
 SAG_V, SAG_PART = 50.0, 0.05  # a settled output this far below its set-point, in SAG_SAMPLES in a row, has sagged
-SAG_SAMPLES = 2
+SAG_SAMPLES = 2  # ... and so many in which a channel that was on says it is off: not every supply flags a trip
 SAFE_SAMPLES = 2  # consecutive measured voltages below SAFE_VOLTAGE before we call the output safe
 
 TRIP = HVFlag.TRIPPED | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.INTERLOCK_OPEN | HVFlag.ARC | HVFlag.FAULT
@@ -38,7 +38,8 @@ class Guard:
     Parameters
     ----------
     supply : HVSupply
-        Nobody else may command it.
+        Nobody else may command it. The current of one that does not measure it is not watched; a missing value from
+        one that does is outside its limits.
     limits, film : Limits, FilmLimits
         What is allowed of voltage and current, and of the pair (displacement, voltage) on the deformed film.
     ramp : float
@@ -64,6 +65,7 @@ class Guard:
         self._tell = tell
         self._low_samples = 0
         self._sagging_samples = 0
+        self._seen_on = False
         self.last: HVSample | None = None
 
     @property
@@ -92,11 +94,15 @@ class Guard:
         faults = self.last.flags & TRIP
         if faults:
             raise FaultError(f"hv: cannot be armed, the supply reports {flag_names(faults)}. Clear the cause first.")
-        self._tell("arm", f"ramp {self._ramp:g} V/s, current limit {self._limits.current.high:g} A")
+        limited = self._supply.measures_current
+        limit = f"current limit {self._limits.current.high:g} A" if limited else "no current limit"
+        self._tell("arm", f"ramp {self._ramp:g} V/s, {limit}")
         self._supply.set_ramp(self._ramp)
-        self._supply.set_current_limit(self._limits.current.high)
+        if limited:
+            self._supply.set_current_limit(self._limits.current.high)
         self.state = GuardState.ARMED
         self.cause = ""
+        self._seen_on = False
 
     def request(self, volts: float, h: float) -> None:
         """Ramp the output to ``volts`` with the disk at displacement ``h`` metres.
@@ -134,14 +140,20 @@ class Guard:
         if self.state is not GuardState.LIVE:
             return
         self._limits.measured_voltage.check(sample.voltage, "HV monitor")
-        self._limits.current.check(sample.current, "HV monitor")
+        if self._supply.measures_current:
+            self._limits.current.check(sample.current, "HV monitor")
         faults = sample.flags & TRIP
         if faults:
             raise FaultError(f"hv: the supply reports {flag_names(faults)}.")
-        settled = HVFlag.ON in sample.flags and HVFlag.RAMPING not in sample.flags
+        on = HVFlag.ON in sample.flags
+        self._seen_on = self._seen_on or on
+        settled = on and HVFlag.RAMPING not in sample.flags
         sagging = settled and not sample.voltage >= sample.setpoint - max(SAG_V, SAG_PART * sample.setpoint)
-        self._sagging_samples = self._sagging_samples + 1 if sagging else 0
+        went_off = self._seen_on and not on
+        self._sagging_samples = self._sagging_samples + 1 if sagging or went_off else 0
         if self._sagging_samples >= SAG_SAMPLES:
+            if went_off:
+                raise FaultError("hv: the supply says that it is off, and nobody switched it off from here.")
             raise FaultError(
                 f"hv: the output has sagged to {sample.voltage:.0f} V with {sample.setpoint:.0f} V set: "
                 "the film draws more current than the supply gives."

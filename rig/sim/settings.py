@@ -33,6 +33,8 @@ DEVICE_FAULTS: dict[str, tuple[str, ...]] = {
         "inhibit",
     ),
 }
+# Which instruments there are to be simulated, where a role has more than one; the first is the default.
+TWINS = {"force": ("gsv8", "cia404"), "hv": ("iseg-edcp", "shvps")}
 # Faults that an instrument cannot have although others of its role can.
 IMPOSSIBLE_FAULTS: dict[str, tuple[str, ...]] = {
     "iseg-edcp": ("split", "merge"),  # a CAN frame is one piece

@@ -62,6 +62,49 @@ def test_a_bad_scene_names_file_key_value_and_what_is_allowed(
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
+        ('driver = "iseg-edcp"', 'driver = "shvps"', ["limits.current_uA is given", "shvps", "leave the limit out"]),
+        ("current_uA = 50.0\n", "", ["must give limits.voltage_V and limits.current_uA"]),
+        ('driver = "gsv8"', 'driver = "hx711"', ["force", "hx711", "gsv8", "cia404"]),
+        ('driver = "gsv8"', 'driver = "cia404"\nfactor = 9.81', ["force", "factor is given without unit"]),
+        ('driver = "gsv8"', 'driver = "cia404"\nbaud = 9600', ["force, baud: unknown key", "bitrate", "node"]),
+        ('driver = "gsv8"', 'driver = "cia404"\ninterface = "slcan"', ["interface and can_channel belong together"]),
+        ("[simulation.force]", '[simulation.force]\ndriver = "cia404"', ["leave simulation.force.driver out"]),
+        ('driver = "gsv8"', 'driver = "cia404"\ninput_range = 2', ["force, input_range: unknown key"]),
+        (
+            "[simulation.force]",
+            "[simulation.force]\nnode = 5",
+            ["simulation, force, node: unknown key", "sensitivity_mV_per_V"],
+        ),
+    ],
+)
+def test_a_bad_choice_of_instruments(tmp_path: Path, old: str, new: str, expected: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_scene(edited(tmp_path, SCENE, old, new))
+    for words in expected:
+        assert words in str(caught.value), str(caught.value)
+
+
+def test_two_instruments_on_one_bus_are_refused(tmp_path: Path) -> None:
+    text = SCENE.read_text()
+    for old, new in {
+        'driver = "zaber"': 'driver = "zaber"\nport = "/dev/a"',
+        'driver = "keyence-lkg"': 'driver = "keyence-lkg"\nport = "/dev/b"',
+        'driver = "gsv8"': 'driver = "cia404"\ninterface = "slcan"\ncan_channel = "/dev/c"',
+        'driver = "iseg-edcp"': 'driver = "iseg-edcp"\ninterface = "slcan"\ncan_channel = "/dev/c"',
+    }.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match="force and hv both name the CAN channel '/dev/c'"):
+        load_scene(path)
+    path.write_text(text.replace("/dev/c", "/dev/d", 1))
+    assert load_scene(path)[0].on_real_ports
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
         ('do = "home"', 'do = "hoem"', ["step 1", "'hoem'", "'home'"]),
         ("cycles = 2", "cycles = 0", ["step 4, cycles = 0", "greater than or equal to 1"]),
         ("speed_mm_per_s = 1.0", "speed_m_per_s = 1.0", ["step 5, speed_m_per_s", "did you mean speed_mm_per_s"]),

@@ -21,6 +21,8 @@ OFF = HVFlag(0)
 class Supply:
     """Writes down what it is told."""
 
+    measures_current = True
+
     def __init__(self) -> None:
         self.told: list[tuple[str, float | None]] = []
 
@@ -158,6 +160,29 @@ def test_a_bad_measurement_while_live_is_an_error_and_the_latch_holds(bad: HVSam
     with pytest.raises(FaultError, match="latched safe"):
         guard.request(0.0, 0.0)
     assert supply.words[-1] == "emergency_off"
+
+
+def test_a_supply_that_does_not_measure_current_is_held_to_its_voltage_only() -> None:
+    guard, supply, _ = make()
+    supply.measures_current = False
+    guard.on_sample(sample(0.0, current=math.nan))
+    guard.on_sample(sample(0.0, current=math.nan))
+    guard.arm()
+    guard.request(1000.0, 0.0)
+    assert supply.words == ["set_ramp", "set_voltage", "switch_on"]
+    guard.on_sample(sample(1000.0, HVFlag.ON, current=math.nan))
+    with pytest.raises(LimitError, match="voltage"):
+        guard.on_sample(sample(2000.0, HVFlag.ON, current=math.nan))
+
+
+def test_a_channel_that_goes_off_by_itself_is_a_fault() -> None:
+    guard, _, _ = live()
+    guard.on_sample(sample(0.0))  # on its way
+    guard.on_sample(sample(0.0))
+    guard.on_sample(sample(1000.0, HVFlag.ON))
+    guard.on_sample(sample(600.0))
+    with pytest.raises(FaultError, match="says that it is off"):
+        guard.on_sample(sample(100.0))
 
 
 def test_off_is_believed_only_when_measured_twice() -> None:
