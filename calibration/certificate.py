@@ -14,7 +14,7 @@ A certificate is a small TOML file, kept beside the scenes that use it and attac
     zero_uncertainty_N = 2e-4            # of a zero taken before the run, drift until its end included
     range_N = [-1.0, 1.0]                # calibrated range; no extrapolation
 
-The keys of a displacement certificate end in ``_m`` with ``gain_m_per_m``, those of an HV certificate in ``_V`` with
+A force sensor that states newtons itself has ``gain_N_per_N`` instead. The keys of a displacement certificate end in ``_m`` with ``gain_m_per_m``, those of an HV certificate in ``_V`` with
 ``gain_V_per_V``.
 """
 
@@ -48,7 +48,9 @@ class Certificate:
     role, instrument, serial, valid_from, valid_until
         As in the file.
     gain : float
-        Quantity (N, m, V) per unit of the reading (mV/V, m, V).
+        Quantity (N, m, V) per unit of the reading.
+    reading_unit : str
+        Unit of the reading that the gain is for: "mV/V" or "N", "m", "V".
     gain_uncertainty : float
         Relative standard uncertainty of the gain.
     noise, zero_uncertainty : float
@@ -67,6 +69,7 @@ class Certificate:
     valid_from: date
     valid_until: date
     gain: float
+    reading_unit: str
     gain_uncertainty: float
     noise: float
     zero_uncertainty: float
@@ -161,7 +164,7 @@ class _File(BaseModel):
         return self
 
     def _certificate(
-        self, role: Role, gain: float, noise: float, zero: float, ends: list[float], name: str, raw: bytes
+        self, role: Role, gain: float, unit: str, noise: float, zero: float, ends: list[float], name: str, raw: bytes
     ) -> Certificate:
         low, high = ends
         if not low < high:
@@ -173,6 +176,7 @@ class _File(BaseModel):
             valid_from=self.valid_from,
             valid_until=self.valid_until,
             gain=gain,
+            reading_unit=unit,
             gain_uncertainty=self.gain_relative_uncertainty,
             noise=noise,
             zero_uncertainty=zero,
@@ -185,15 +189,22 @@ class _File(BaseModel):
 
 class _ForceFile(_File):
     role: Literal["force"]
-    gain_N_per_mV_per_V: Positive
+    gain_N_per_mV_per_V: Positive | None = None
+    gain_N_per_N: Positive | None = None
     noise_N: Positive
     zero_uncertainty_N: NotNegative
     range_N: Range
 
+    @model_validator(mode="after")
+    def _one_gain(self) -> _ForceFile:
+        if (self.gain_N_per_mV_per_V is None) == (self.gain_N_per_N is None):
+            raise ValueError("give either gain_N_per_mV_per_V or gain_N_per_N, as the sensor's readings are")
+        return self
+
     def certificate(self, name: str, raw: bytes) -> Certificate:
-        return self._certificate(
-            "force", self.gain_N_per_mV_per_V, self.noise_N, self.zero_uncertainty_N, self.range_N, name, raw
-        )
+        gain, unit = (self.gain_N_per_mV_per_V, "mV/V") if self.gain_N_per_N is None else (self.gain_N_per_N, "N")
+        assert gain is not None  # _one_gain
+        return self._certificate("force", gain, unit, self.noise_N, self.zero_uncertainty_N, self.range_N, name, raw)
 
 
 class _DisplacementFile(_File):
@@ -205,7 +216,7 @@ class _DisplacementFile(_File):
 
     def certificate(self, name: str, raw: bytes) -> Certificate:
         return self._certificate(
-            "displacement", self.gain_m_per_m, self.noise_m, self.zero_uncertainty_m, self.range_m, name, raw
+            "displacement", self.gain_m_per_m, "m", self.noise_m, self.zero_uncertainty_m, self.range_m, name, raw
         )
 
 
@@ -218,7 +229,7 @@ class _HVFile(_File):
 
     def certificate(self, name: str, raw: bytes) -> Certificate:
         return self._certificate(
-            "hv", self.gain_V_per_V, self.noise_V, self.zero_uncertainty_V, self.range_V, name, raw
+            "hv", self.gain_V_per_V, "V", self.noise_V, self.zero_uncertainty_V, self.range_V, name, raw
         )
 
 

@@ -54,7 +54,7 @@ def by_specimen(curves: Sequence[Curve]) -> dict[str, list[int]]:
     for index, curve in enumerate(curves):
         s = curve.specimen
         title = (
-            f"{s.name + ': ' if s.name else ''}a = {s.disk_radius * 1e3:g} mm, b = {s.ring_radius * 1e3:g} mm, "
+            f"{s.name or 'specimen'}\na = {s.disk_radius * 1e3:g} mm, b = {s.ring_radius * 1e3:g} mm, "
             f"T = {s.thickness * 1e6:g} µm, λp = {s.prestretch:g}"
         )
         groups.setdefault(title, []).append(index)
@@ -122,7 +122,7 @@ def residuals(identification: Identification, curves: Sequence[Curve], selection
                         panel = (ax, identification, curves[index], selections[index], styles[voltage])
                         largest = max(largest, _residual_panel(*panel))
                 ax.axhline(0.0, color="black", lw=0.8, zorder=2)
-                ax.set_title(f"{list(groups)[column].split(',')[0]}, {voltage:g} V")
+                ax.set_title(f"{list(groups)[column].splitlines()[0]}, {voltage:g} V")
         for ax in axes[-1]:
             ax.set_xlabel("displacement h / mm")
         for ax in axes[:, 0]:
