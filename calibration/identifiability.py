@@ -79,5 +79,5 @@ def _added(curve: Curve, farther: float, prestretch: float) -> Curve:
 
 def _percent(relative: float) -> str:
     if relative > 10.0:
-        return f"{relative:.2g} times its value"
+        return f"{relative:.0f} times its value"
     return f"{100 * relative:.2g} %" if relative < 1.0 else f"{100 * relative:.0f} %"
