@@ -149,6 +149,29 @@ def fit(logs: tuple[Path, ...], out: Path | None, report: Path | None, terms: in
             click.echo(f"written: {path}")
 
 
+@main.command("fit-tests")
+@click.argument("tests", nargs=-1, required=True, type=FILE)
+@click.option("-o", "--out", type=FILE, help="Result as JSON.")
+@click.option("--terms", type=click.IntRange(1, 4), default=3, show_default=True, help="Ogden terms.")
+@click.option("--predict", multiple=True, type=FILE, help="A test that takes no part and is predicted.")
+def fit_tests(tests: tuple[Path, ...], out: Path | None, terms: int, predict: tuple[Path, ...]) -> None:
+    """Identify Ogden parameters from homogeneous TESTS (CSV) of a sheet, all at once.
+
+    Columns are stretch and nominal_stress_MPa (or _kPa, _Pa); for biaxial tests stretch1, stretch2,
+    nominal_stress1_MPa, nominal_stress2_MPa. A remark "# kind: uniaxial" (equibiaxial, pure shear, biaxial), or the
+    file's name, says which test it is.
+    """
+    from rig.identification import identify_tests, write_text
+    from rig.tables import show, tests_table
+
+    found = identify_tests(tests, predict, terms)
+    if out is not None:
+        write_text(out, found.to_json())
+    show(tests_table(found))
+    if out is not None:
+        click.echo(f"written: {out}")
+
+
 @main.command()
 @click.argument("log", type=FILE)
 @click.option("--save", type=FILE, help="Write a Rerun recording instead of opening the viewer.")
@@ -210,6 +233,15 @@ def benchmark_extremes(full: bool, out: Path) -> None:
     from rig.benchmark import extremes
 
     _benchmark(extremes.run, extremes.render, "extremes", full, out)
+
+
+@benchmark.command("rates")
+@_benchmark_options
+def benchmark_rates(full: bool, out: Path) -> None:
+    """Samples lost and processor used with all serial drivers on pseudo-terminals, force at 1 kHz."""
+    from rig.benchmark import rates
+
+    _benchmark(rates.run, rates.render, "rates", full, out)
 
 
 def _benchmark(run: Callable[..., Any], render: Callable[..., Any], name: str, full: bool, out: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from calibration.certificate import Certificate, CertificateError, parse_certificate
 from calibration.curve import Curve, CurveError
+from calibration.homogeneous import TestsError, TestsFit, fit_tests, load_test
 from calibration.identify import IdentificationError, identify
 from calibration.result import Identification
 from model.materials import Material
@@ -68,9 +69,7 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
     """
     try:
         if fit is not None:
-            part = fit.with_name(fit.name + ".part")
-            part.write_text(found.identification.to_json(), encoding="utf-8")
-            part.replace(fit)
+            write_text(fit, found.identification.to_json())
         if report is not None:
             from calibration.report import write_report
 
@@ -84,6 +83,38 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
             )
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file that appears whole or not at all.
+
+    Raises
+    ------
+    ConfigError
+        When it cannot be written.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}.") from None
+
+
+def identify_tests(tests: Sequence[Path], predict: Sequence[Path], terms: int) -> TestsFit:
+    """Identify Ogden terms from homogeneous tests in CSV files; ``predict`` are held against the result.
+
+    Raises
+    ------
+    DataError
+        When a file cannot be read as a test, or the tests cannot be fitted.
+    """
+    try:
+        return fit_tests(
+            [load_test(path) for path in tests], terms=terms, predict=[load_test(path) for path in predict]
+        )
+    except TestsError as error:
+        raise DataError(f"{error}.") from None
 
 
 def _errors(run: Run, scene: Scene) -> CurveErrors:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
+    from calibration.homogeneous import TestsFit
     from calibration.result import Identification
     from drivers.discovery import Found as FoundDevice
     from rig.experiment import Experiment
@@ -85,6 +86,30 @@ def identification_table(found: Identification) -> Group:
     ]
     lines += [f"note: {warning}" for warning in found.warnings]
     return Group(*lines)
+
+
+def tests_table(found: TestsFit) -> Group:
+    """Ogden terms from homogeneous tests, and how much of each test they explain."""
+    table = Table(title=f"Identified from homogeneous tests with {len(found.mu)} Ogden terms")
+    for heading in ("quantity", "value", "standard uncertainty", "relative", "verdict"):
+        table.add_column(heading, justify="left" if heading in ("quantity", "verdict") else "right")
+    for name, quantity in found.quantities.items():
+        table.add_row(
+            _NAMES.get(name, name),
+            _with_unit(quantity.value, quantity.unit, 5),
+            _with_unit(quantity.uncertainty, quantity.unit, 2),
+            f"{100 * quantity.relative:.2g} %",
+            quantity.verdict,
+        )
+    explained = Table(title="Share of variance explained, R^2")
+    explained.add_column("test")
+    explained.add_column("fitted", justify="right")
+    explained.add_column("predicted", justify="right")
+    for name, share in found.r_squared.items():
+        explained.add_row(name, f"{share:.5f}", "")
+    for name, share in found.prediction.items():
+        explained.add_row(name, "", f"{share:.5f}")
+    return Group(table, explained, *(f"note: {warning}" for warning in found.warnings))
 
 
 def truth_table(found: Found) -> RenderableType:
