@@ -14,8 +14,8 @@ A certificate is a small TOML file, kept beside the scenes that use it and attac
     zero_uncertainty_N = 2e-4            # of a zero taken before the run, drift until its end included
     range_N = [-1.0, 1.0]                # calibrated range; no extrapolation
 
-A force sensor that states newtons itself has ``gain_N_per_N`` instead. The keys of a displacement certificate end in ``_m`` with ``gain_m_per_m``, those of an HV certificate in ``_V`` with
-``gain_V_per_V``.
+A force sensor that states newtons itself has ``gain_N_per_N`` instead. The keys of a displacement certificate end in
+``_m`` with ``gain_m_per_m``, those of an HV certificate in ``_V`` with ``gain_V_per_V``.
 """
 
 from __future__ import annotations

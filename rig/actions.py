@@ -90,7 +90,7 @@ def _zero(engine: Engine, action: Action) -> Turns:
         yield from _pause(engine, action.parameters["duration"])
     recorder.force_zero, error = _mean(force, "force")
     engine.force_noise = error * math.sqrt(len(force)) * engine.gains.force
-    recorder.reference("force_zero", recorder.force_zero, error, "mV/V")
+    recorder.reference("force_zero", recorder.force_zero, error, engine.bench.force.reading_unit)
     if recorder.has_laser:
         recorder.displacement_zero, error = _mean(laser, "displacement")
         recorder.reference("displacement_zero", recorder.displacement_zero, error, "m")

@@ -215,6 +215,13 @@ class Engine:
                     f"{role}: the scene names serial number {table.serial}, but {found.serial or 'no serial number'} "
                     "answered. Are two instruments swapped? Nothing was moved and no output changed."
                 )
+        unit = self.bench.force.reading_unit
+        self.recorder.units(unit)
+        if unit != self.gains.force_unit:
+            raise ConfigError(
+                f"force: the certificate is for readings in {self.gains.force_unit}, but the instrument gives them in "
+                f"{unit}. Use the instrument's own certificate. Nothing was moved and no output changed."
+            )
         self._last_sample = dict.fromkeys(self.bench.devices, self.clock.now())
         self._silence = self._allowed_silence()
 

@@ -129,7 +129,8 @@ def _check_dates(certificates: dict[str, Certificate], clock: Clock) -> list[str
 
 def _gains(certificates: dict[str, Certificate]) -> Gains:
     gain = {role: certificate.gain for role, certificate in certificates.items()}
-    return Gains(gain.get("force", 1.0), gain.get("displacement", 1.0), gain.get("hv", 1.0))
+    force = certificates["force"]  # every scene names it
+    return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit)
 
 
 def _attach(log: LogWriter, experiment: Experiment, problems: list[str]) -> None:

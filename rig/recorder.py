@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 class Gains:
     """Quantity per reading of each sensor, from the certificates; 1.0 for a sensor that states SI itself."""
 
-    force: float = 1.0  # N per mV/V
+    force: float = 1.0  # N per `force_unit`
     displacement: float = 1.0
     voltage: float = 1.0
+    force_unit: str = "mV/V"  # of the force sensor's readings, as its certificate has it
 
 
 class Recorder:
@@ -76,7 +77,7 @@ class Recorder:
                 self._write(
                     "/force/sample",
                     sample.t,
-                    reading_mV_per_V=sample.reading,
+                    reading=sample.reading,
                     force_N=self.quantity_of(sample),
                     flags=sample.flags.value,
                 )
@@ -133,6 +134,16 @@ class Recorder:
             standard_uncertainty=standard_uncertainty,
             unit=unit,
         )
+
+    def units(self, force: str) -> None:
+        """Write the unit of what has none in its name: the readings of the force sensor."""
+        if self.log_failed:
+            return
+        try:
+            self._log.metadata("units", {"/force/sample reading": force})
+        except LogError:
+            self.log_failed = True
+            raise
 
     def phase(self, fields: Mapping[str, object]) -> None:
         """Write the beginning of an action."""

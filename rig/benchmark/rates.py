@@ -268,7 +268,7 @@ def _whole_run(path: Path, folder: Path, progress: Callable[[float], None]) -> R
     gaps = np.round(np.diff(t) * FORCE_HZ) - 1
     rates = {"stage": STAGE_HZ, "displacement": LASER_HZ}
     reached = {role: len(t) / (t[-1] - t[0]) for role in rates for t in (tables[f"/{role}/sample"]["t_s"],)}
-    readings = tables["/force/sample"]["reading_mV_per_V"]
+    readings = tables["/force/sample"]["reading"]
     lasted = float(t[-1] - t[0])
     return Row(
         WHOLE_RUN,

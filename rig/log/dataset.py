@@ -97,7 +97,7 @@ class Run:
     phase: NDArray[np.intp]
     phases: list[Phase]
     references: list[Reference]
-    force_per_reading: float  # N per mV/V, as applied during the run; NaN when no force was recorded
+    force_per_reading: float  # N per unit of the reading, as applied during the run; NaN when no force was recorded
 
     @property
     def has_laser(self) -> bool:
@@ -210,7 +210,7 @@ def load_run(path: Path, latency: Mapping[str, float] | None = None) -> Run:
     force = tables["/force/sample"]
     order = np.argsort(times["/force/sample"], kind="stable")
     t = times["/force/sample"][order]
-    newton, reading = force["force_N"][order], force["reading_mV_per_V"][order]
+    newton, reading = force["force_N"][order], force["reading"][order]
     h_topic = "/displacement/sample" if "/displacement/sample" in log.topics else "/stage/sample"
     if "/hv/sample" in log.topics:
         voltage = interpolate(t, times["/hv/sample"], tables["/hv/sample"]["voltage_V"])
@@ -267,7 +267,7 @@ def _newest(t: Floats, references: list[Reference], name: str) -> Floats:
 
 
 def _gain(force: Floats, net_reading: Floats) -> float:
-    """Newtons per mV/V as applied: the ratio at the sample with the largest net reading."""
+    """Newtons per unit of the reading as applied: the ratio at the sample with the largest net reading."""
     usable = np.flatnonzero(np.isfinite(force) & np.isfinite(net_reading) & (net_reading != 0))
     if not usable.size:
         return float("nan")

@@ -11,7 +11,7 @@ import numpy as np
 from rig.log.dataset import Run, load_run
 from rig.log.errors import LogError
 from rig.log.part_file import PartFile
-from rig.log.reader import Columns, read_log
+from rig.log.reader import Columns, Log, read_log
 
 FORMATS = (".csv", ".parquet")
 _ROWS = 20_000  # written at once
@@ -22,7 +22,8 @@ def export(path: Path, out: Path, topic: str | None = None) -> int:
 
     Without ``topic`` the table is the run on the time base of the force samples, as `rig.log.dataset.Run` aligns it:
     t_s, displacement_m, force_N, voltage_V, flagged, step, kind, label, cycle, direction, nominal_voltage_V, record.
-    With a topic it is that topic as recorded, and the times in nanoseconds since 1970.
+    With a topic it is that topic as recorded, and the times in nanoseconds since 1970; the force sensor's ``reading``
+    gets its unit into its name.
 
     A value that is missing is an empty field in CSV and NaN in Parquet. Text in a CSV file that a spreadsheet would
     run as a formula gets an apostrophe in front. Bytes are written in hexadecimal.
@@ -34,7 +35,7 @@ def export(path: Path, out: Path, topic: str | None = None) -> int:
     """
     if out.suffix not in FORMATS:
         raise LogError(out, "has an ending that says no known format", f"Allowed: {' and '.join(FORMATS)}.")
-    table = _run_table(load_run(path)) if topic is None else read_log(path).columns(topic)
+    table = _run_table(load_run(path)) if topic is None else _topic_table(read_log(path), topic)
     rows = len(next(iter(table.values())))
     file = PartFile(out)
     try:
@@ -48,6 +49,11 @@ def export(path: Path, out: Path, topic: str | None = None) -> int:
             file.discard()
         raise
     return rows
+
+
+def _topic_table(log: Log, topic: str) -> Columns:
+    unit = log.metadata.get("units", {}).get(f"{topic} reading", "").replace("/", "_per_")
+    return {f"{name}_{unit}" if unit and name == "reading" else name: c for name, c in log.columns(topic).items()}
 
 
 def _run_table(run: Run) -> Columns:

@@ -24,7 +24,7 @@ def info(path: Path) -> str:
     lines += _table("run", log.metadata.get("run", {}))
     lines += [_row("began", _date(log.start_ns)), _row("lasted", f"{(log.end_ns - log.start_ns) * 1e-9:.3f} s")]
     lines += _table("outcome", log.outcome if log.outcome is not None else {"status": "not recorded"})
-    lines += ["", *_devices(log)]
+    lines += ["", *_devices(log), *_table("unit of", log.metadata.get("units", {}))]
     lines += ["", *_rates(log)]
     if log.attachments:
         lines += ["", "inside"]

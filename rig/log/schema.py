@@ -20,8 +20,8 @@ from google.protobuf.message_factory import GetMessageClass
 
 from drivers.roles import HVFlag, SampleFlag
 
-SCHEMA_VERSION = 1
-PACKAGE = "dearig.v1"
+SCHEMA_VERSION = 2
+PACKAGE = "dearig.v2"
 ROLES = ("stage", "force", "displacement", "hv")
 
 
@@ -67,7 +67,11 @@ CHANNELS: dict[str, Channel] = {
         "ForceSample",
         (
             _T,
-            Field("reading_mV_per_V", "double", "bridge reading in millivolts per volt; NaN when there is no value"),
+            Field(
+                "reading",
+                "double",
+                "reading in the sensor's own unit, which the metadata `units` names; NaN when there is no value",
+            ),
             Field("force_N", "double", "force on the film in newtons, zero and sensitivity applied"),
             _FLAGS,
         ),
@@ -86,7 +90,9 @@ CHANNELS: dict[str, Channel] = {
         (
             _T,
             Field("voltage_V", "double", "measured output voltage in volts"),
-            Field("current_A", "double", "measured output current in amperes"),
+            Field(
+                "current_A", "double", "measured output current in amperes; NaN where the supply does not measure it"
+            ),
             Field("setpoint_V", "double", "set-point read back from the supply, in volts"),
             Field("flags", "fixed32", f"state of the channel, a sum of: {_flag_values(HVFlag)}"),
         ),
@@ -157,7 +163,7 @@ _TYPES = {
 
 
 def schema_name(topic: str) -> str:
-    """Full protobuf name of the message on ``topic``, e.g. ``dearig.v1.ForceSample``."""
+    """Full protobuf name of the message on ``topic``, e.g. ``dearig.v2.ForceSample``."""
     return f"{PACKAGE}.{CHANNELS[topic].message}"
 
 

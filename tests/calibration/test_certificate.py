@@ -71,6 +71,8 @@ def test_the_range_is_not_extrapolated() -> None:
         ("noise_N = 5e-3", 'noise_N = "5 mN"', ["noise_N", "valid number", "5 mN"]),
         ("noise_N = 5e-3", "noise_mN = 5.0", ["noise_N", "noise_mN", "not permitted"]),
         ("gain_N_per_mV_per_V = 0.5", "gain_N_per_mV_per_V = 0.0", ["gain_N_per_mV_per_V", "greater than 0"]),
+        ("gain_N_per_mV_per_V = 0.5\n", "", ["gain_N_per_mV_per_V", "gain_N_per_N"]),
+        ("gain_N_per_mV_per_V = 0.5", "gain_N_per_mV_per_V = 0.5\ngain_N_per_N = 1.0", ["either"]),
         ("gain_relative_uncertainty = 1e-3", "gain_relative_uncertainty = inf", ["gain_relative_uncertainty"]),
         ("range_N = [-1.0, 1.0]", "range_N = [1.0, -1.0]", ["range", "lower to the higher"]),
         ('role = "force"', 'role = "hv"', ["gain_V_per_V", "Field required"]),
@@ -103,7 +105,16 @@ def test_files_that_are_not_certificates(tmp_path: Path) -> None:
 
 
 def test_the_examples_are_for_the_instruments_that_the_simulation_has() -> None:
-    from rig.sim.settings import ForceTruth, HVTruth
+    from rig.sim.settings import CiA404Truth, ForceTruth, HVTruth
 
-    for name, serial in (("force", ForceTruth().serial_number), ("hv", HVTruth().serial_number)):
+    for name, serial in (
+        ("force", ForceTruth().serial_number),
+        ("force-can", CiA404Truth(driver="cia404").serial_number),
+        ("hv", HVTruth().serial_number),
+    ):
         assert load_certificate(EXAMPLES / f"{name}.toml").check(str(serial), date(2020, 1, 1)) == []
+
+
+@pytest.mark.parametrize(("name", "unit"), [("force", "mV/V"), ("force-can", "N"), ("displacement", "m"), ("hv", "V")])
+def test_a_certificate_says_what_its_readings_are_in(name: str, unit: str) -> None:
+    assert load_certificate(EXAMPLES / f"{name}.toml").reading_unit == unit

@@ -21,7 +21,7 @@ SAMPLES: dict[str, dict[str, Any]] = {
         "raw_steps": -31496,
         "warnings": "WR FQ",
     },
-    "/force/sample": {"reading_mV_per_V": -0.0, "force_N": 0.1, "flags": 4},
+    "/force/sample": {"reading": -0.0, "force_N": 0.1, "flags": 4},
     "/displacement/sample": {"reading_m": 0.0, "displacement_m": 5e-324, "flags": 0},
     "/hv/sample": {"voltage_V": 1499.75, "current_A": 1e-9, "setpoint_V": 1500.0, "flags": 1023},
     "/target": {"displacement_m": 2e-3, "voltage_V": 1500.0, "speed_m_per_s": 1e-4},

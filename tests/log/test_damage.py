@@ -81,7 +81,7 @@ def write_log_module() -> Any:
             log.attach("scene.toml", "application/toml", b'title = "small"\n')
             for k in range(n):
                 t, ns = 0.04 * k, 10**18 + 40_000_000 * k
-                log.write("/force/sample", {"t_s": t, "reading_mV_per_V": 0.1 * k, "force_N": -t, "flags": k}, ns, ns)
+                log.write("/force/sample", {"t_s": t, "reading": 0.1 * k, "force_N": -t, "flags": k}, ns, ns)
                 log.write("/raw/force/rx", {"t_s": t, "data": bytes([k, 0xFF, 6, 0])}, ns, ns)
                 if k % 2:
                     event = {"t_s": t, "severity": "info", "source": "test", "message": f"{k}"}
@@ -168,7 +168,7 @@ def test_power_cuts(tmp_path):
     path = tmp_path / "a.mcap"
     with LogWriter(path) as writer:
         for k in range(800):
-            fields = {"t_s": k * 1e-3, "reading_mV_per_V": 0.1 * k, "force_N": float(k), "flags": 0}
+            fields = {"t_s": k * 1e-3, "reading": 0.1 * k, "force_N": float(k), "flags": 0}
             writer.write("/force/sample", fields, k * 10**6, k * 10**6)
             writer.tick(k * 1e-3)
         writer.finish({})
@@ -220,7 +220,7 @@ def message(payload: bytes, sequence: int = 1, channel: int = 1) -> bytes:
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = MAGIC + record(1, text(b"") + text(b"evil"))
-FORCE = schema.encode("/force/sample", {"t_s": 0.0, "reading_mV_per_V": 0.0, "force_N": 1.0, "flags": 0})
+FORCE = schema.encode("/force/sample", {"t_s": 0.0, "reading": 0.0, "force_N": 1.0, "flags": 0})
 GOOD = chunk(described() + message(FORCE))
 
 

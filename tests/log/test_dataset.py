@@ -53,7 +53,7 @@ def write_run(path: Path, *, laser: bool = True, hv: bool = True, lost=(), flagg
                 write("/reference", t, name="displacement_zero", value=2e-3, standard_uncertainty=1e-6, unit="m")
                 write("/reference", t, name="contact_position", value=7e-3, standard_uncertainty=3e-6, unit="m")
             reading = 0.25 + float(truth_force(t)) / GAIN
-            write("/force/sample", t, reading_mV_per_V=reading, force_N=GAIN * (reading - zero), flags=4 * (k == 250))
+            write("/force/sample", t, reading=reading, force_N=GAIN * (reading - zero), flags=4 * (k == 250))
             if k % 2 == 0:
                 h = float(truth_h(t))
                 write("/stage/sample", t, position_m=7e-3 + h, moving=False, referenced=True, raw_steps=k, warnings="")

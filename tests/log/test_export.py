@@ -19,7 +19,7 @@ def run(tmp_path):
             if k == 1:
                 phase = {"step": 2, "kind": "ramp", "label": "=HYPERLINK()", "cycle": 1, "direction": 1}
                 log.write("/phase", {"t_s": 0.1, **phase, "voltage_V": 500.0, "record": True}, ns, ns)
-            force = {"reading_mV_per_V": 0.1, "force_N": math.nan if k == 0 else 0.1 * k, "flags": 4 * (k == 3)}
+            force = {"reading": 0.1, "force_N": math.nan if k == 0 else 0.1 * k, "flags": 4 * (k == 3)}
             log.write("/force/sample", {"t_s": 0.1 * k, **force}, ns, ns)
             laser = {"reading_m": 0.0, "displacement_m": 1e-4 * k, "flags": 0}
             log.write("/displacement/sample", {"t_s": 0.1 * k, **laser}, ns, ns)

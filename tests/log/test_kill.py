@@ -21,7 +21,7 @@ with LogWriter(Path(sys.argv[1])) as log:
     k = 0
     while True:
         ns = clock.epoch_ns(k * 1e-3)
-        log.write("/force/sample", {"t_s": k * 1e-3, "reading_mV_per_V": float(k), "force_N": -k, "flags": 0}, ns, ns)
+        log.write("/force/sample", {"t_s": k * 1e-3, "reading": float(k), "force_N": -k, "flags": 0}, ns, ns)
         log.tick(clock.now())
         k += 1
         sys.stdout.buffer.write(k.to_bytes(4, "little"))  # what had been handed to the log
@@ -48,7 +48,7 @@ def check(path, delay):
     saved = len(columns["t_s"])
     # the message after the last count may have reached the log too
     assert written - 100 <= saved <= written + 1
-    assert (columns["reading_mV_per_V"] == range(saved)).all()
+    assert (columns["reading"] == range(saved)).all()
     assert not log.ended and log.missing == {}
 
 

@@ -9,7 +9,7 @@ from rig.log import schema
 
 def test_bytes_on_the_wire():
     """Tags, order and presence, spelled out by hand from the protobuf encoding rules."""
-    data = schema.encode("/force/sample", {"t_s": 1.0, "reading_mV_per_V": 0.0, "force_N": -2.5, "flags": 3})
+    data = schema.encode("/force/sample", {"t_s": 1.0, "reading": 0.0, "force_N": -2.5, "flags": 3})
     expected = (
         b"\x09" + struct.pack("<d", 1.0)
         + b"\x11" + struct.pack("<d", 0.0)  # zeros are written, so that nothing is guessed at reading
@@ -29,14 +29,14 @@ def test_every_topic_round_trips(samples):
 
 
 def test_nan_and_infinity_survive():
-    fields = {"t_s": math.inf, "reading_mV_per_V": math.nan, "force_N": -math.inf, "flags": 0}
+    fields = {"t_s": math.inf, "reading": math.nan, "force_N": -math.inf, "flags": 0}
     decoded = schema.decode("/force/sample", schema.encode("/force/sample", fields))
     assert decoded["t_s"] == math.inf
-    assert math.isnan(decoded["reading_mV_per_V"])
+    assert math.isnan(decoded["reading"])
     assert decoded["force_N"] == -math.inf
 
 
-GOOD = {"t_s": 0.0, "reading_mV_per_V": 0.0, "force_N": 0.0, "flags": 0}
+GOOD = {"t_s": 0.0, "reading": 0.0, "force_N": 0.0, "flags": 0}
 
 
 @pytest.mark.parametrize(
@@ -79,11 +79,12 @@ def test_text_that_is_not_utf8_is_refused():
 
 
 def test_units_stand_in_the_names():
-    """Every double says its unit, but for a reference, which carries it in a field of its own."""
-    units = ("_s", "_m", "_N", "_V", "_A", "_mV_per_V", "_m_per_s")
+    """Every double says its unit, but for a reference, which carries it in a field of its own, and the reading of a
+    force sensor, whose unit is the sensor's and stands in the metadata ``units``."""
+    units = ("_s", "_m", "_N", "_V", "_A", "_m_per_s")
     for topic, channel in schema.CHANNELS.items():
         for field in channel.fields:
-            if field.type == "double" and topic != "/reference":
+            if field.type == "double" and topic != "/reference" and (topic, field.name) != ("/force/sample", "reading"):
                 assert field.name.endswith(units), f"{topic}.{field.name}"
 
 

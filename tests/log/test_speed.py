@@ -15,7 +15,7 @@ from rig.log.writer import LogWriter
 def test_ten_minutes_at_a_kilohertz(tmp_path):
     path = tmp_path / "long.mcap"
     n = 600_000
-    force = {"reading_mV_per_V": 0.0, "force_N": 0.0, "flags": 0}
+    force = {"reading": 0.0, "force_N": 0.0, "flags": 0}
     laser = {"reading_m": 0.0, "displacement_m": 0.0, "flags": 0}
     began = time.process_time()
     with LogWriter(path) as log:
@@ -23,7 +23,7 @@ def test_ten_minutes_at_a_kilohertz(tmp_path):
             t, ns = k * 1e-3, k * 1_000_000
             x = math.sin(t)
             log.write("/raw/force/rx", {"t_s": t, "data": b"\xaa\x11\x22\x33\x44\x85"}, ns, ns)
-            log.write("/force/sample", {**force, "t_s": t, "reading_mV_per_V": x, "force_N": 2 * x}, ns, ns)
+            log.write("/force/sample", {**force, "t_s": t, "reading": x, "force_N": 2 * x}, ns, ns)
             log.write("/raw/displacement/rx", {"t_s": t, "data": b"M1,+01.2345\r"}, ns, ns)
             log.write("/displacement/sample", {**laser, "t_s": t, "reading_m": x, "displacement_m": 3 * x}, ns, ns)
             log.tick(t)

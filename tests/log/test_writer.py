@@ -13,7 +13,7 @@ from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
 
-FORCE = {"t_s": 0.0, "reading_mV_per_V": 0.5, "force_N": 0.1, "flags": 0}
+FORCE = {"t_s": 0.0, "reading": 0.5, "force_N": 0.1, "flags": 0}
 
 
 def write_force(log: LogWriter, k: int) -> None:

@@ -43,7 +43,7 @@ def log(tmp_path: Path) -> Path:
                 write("/phase", t, step=1 + k // 200, kind="sweep", label="up", cycle=0, direction=direction,
                       voltage_V=v, record=True)  # fmt: skip
             h = 1e-3 * (1.0 - abs(1.0 - t % 2.0))
-            write("/force/sample", t, reading_mV_per_V=h, force_N=20 * h, flags=0)
+            write("/force/sample", t, reading=h, force_N=20 * h, flags=0)
             write("/displacement/sample", t, reading_m=h, displacement_m=h, flags=0)
             if k % 10 == 0:
                 write("/hv/sample", t, voltage_V=v, current_A=0.0, setpoint_V=v, flags=1)
@@ -94,7 +94,7 @@ def test_without_hv_there_is_no_voltage(tmp_path):
     path = tmp_path / "run.mcap"
     with LogWriter(path) as writer:
         for k in range(10):
-            fields = {"t_s": k / 10, "reading_mV_per_V": 0.0, "force_N": 0.1 * k, "flags": 0}
+            fields = {"t_s": k / 10, "reading": 0.0, "force_N": 0.1 * k, "flags": 0}
             writer.write("/force/sample", fields, k, k)
             laser = {"t_s": k / 10, "reading_m": 0.0, "displacement_m": 1e-4 * k, "flags": 0}
             writer.write("/displacement/sample", laser, k, k)
@@ -180,7 +180,7 @@ def test_without_a_scene_there_is_no_film_but_the_rest(tmp_path, scene):
     with LogWriter(path) as writer:
         if scene is not None:
             writer.attach("scene.toml", "application/toml", scene)
-        writer.write("/force/sample", {"t_s": 0.5, "reading_mV_per_V": 0.0, "force_N": 0.1, "flags": 0}, 0, 0)
+        writer.write("/force/sample", {"t_s": 0.5, "reading": 0.0, "force_N": 0.1, "flags": 0}, 0, 0)
         writer.finish({})
     view(path, save=tmp_path / "run.rrd")
 
