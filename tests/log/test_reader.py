@@ -139,7 +139,7 @@ def test_another_schema_version_is_refused(small, monkeypatch):
     monkeypatch.setitem(schema.CHANNELS, "/force/sample", changed)
     schema.schema_data.cache_clear()
     try:
-        with pytest.raises(LogError, match=rf"/force/sample are of another kind .* schema version {schema.SCHEMA_VERSION}"):
+        with pytest.raises(LogError, match=rf"/force/sample are of another kind .* version {schema.SCHEMA_VERSION}"):
             read_log(small)
     finally:
         monkeypatch.undo()
