@@ -23,6 +23,7 @@ MOST_STEPS = 25
 NEWTON_FACTOR = 0.3
 RUNG_FACTOR = 0.5
 ROUND_OFF = 1e-13
+FOLDED = -1e-3  # of G: a hoop stress below it will not turn out positive on a finer rung
 LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two rungs may agree by chance
 
 
@@ -38,6 +39,7 @@ class Iterate:
     stable: NDArray[np.bool_]
     ok: NDArray[np.bool_]
     steps: NDArray[np.intp]
+    hoop: Array | None = None  # least hoop stress at the points before the last step
 
 
 Settle = Callable[[Problem, Grid, State, float], Iterate]
@@ -68,9 +70,14 @@ def next_modes(modes: int) -> int:
 
 
 def advance(state: State, step: ritz.Step, at: ritz.Points, grid: Grid) -> tuple[State, Array]:
-    """The state after a Newton step, shortened where a slope would change beyond reason; and the largest change."""
+    """The state after a Newton step, shortened where a slope would change beyond reason; and the largest change.
+
+    Where the tension is a small rest of elastic and Maxwell stress, the force feels the change that much more.
+    """
     w = state.w
     change = np.abs(step.dw / w).max(axis=(0, 1))
+    if at.law.maxwell is not None:
+        change *= np.sqrt(1.0 + np.abs(at.law.maxwell / at.law.t1).max(axis=(0, 1)))
     short: Array | float = 1.0
     if not change.max() <= 0.8:
         short = np.where(change > 2.0, 2.0 / change, 1.0)
@@ -117,14 +124,17 @@ def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
             break
         if n >= 4 and states > 1 and done.mean() > 0.5:
             rest = np.flatnonzero(~done)
-            ends = tail(problem, grid, state, step)
+            ends, hoop = tail(problem, grid, state, step), at.law.t2.min(axis=(0, 1))
             more = newton(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n)
             state.put(rest, more.state)
             lam[rest], change[rest], stable[rest], ends[rest] = more.lam, more.change, more.stable, more.tail
             steps[rest] += more.steps
-            return Iterate(grid, state, lam, change, ends, stable, (change <= goal) & stable & (lam > 0.0), steps)
+            hoop[rest] = more.hoop
+            ok = (change <= goal) & stable & (lam > 0.0)
+            return Iterate(grid, state, lam, change, ends, stable, ok, steps, hoop)
     ends = tail(problem, grid, state, step)
-    return Iterate(grid, state, lam, change, ends, stable, done & stable & (lam > 0.0), steps)
+    hoop = at.law.t2.min(axis=(0, 1))
+    return Iterate(grid, state, lam, change, ends, stable, done & stable & (lam > 0.0), steps, hoop)
 
 
 @dataclass(slots=True)
@@ -197,10 +207,12 @@ def climb(
     *,
     sensitivities: bool = False,
     settle: Settle = newton,
+    taut: bool = False,
 ) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
     """Solve a block of states to ``tolerance`` (relative, force), each with the resolution that it needs.
 
-    Returns the answers, the states that have none, and the steps spent on every state.
+    With ``taut`` a state whose hoop stress is clearly negative is given up at once. Returns the answers, the states
+    that have none, and the steps spent on every state.
     """
     index = np.arange(len(problem.span))
     total = np.zeros(len(index), dtype=np.intp)
@@ -213,6 +225,8 @@ def climb(
         start = Start(result.grid, result.state)
         total[index] += result.steps
         lam, ok = result.lam, result.ok
+        if taut and result.hoop is not None:
+            ok &= result.hoop > FOLDED
         modes = start.grid.table.modes
         if previous is not None:
             error = estimate(lam, previous, result.change, result.tail, tolerance)

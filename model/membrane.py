@@ -22,7 +22,7 @@ Wrinkling = Literal["plain", "tension_field"]
 BLOCK = 1024  # states solved together: their arrays stay in the processor's cache
 # Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
 # followed from rest.
-SOFTENING = 0.25
+SOFTENING = 0.35
 TRACE_MODES = 10
 FLAT = -1e-13  # of G: a hoop stress that is zero in the exact solution may come out as round-off
 
@@ -447,7 +447,7 @@ class _Block:
         breaks = problem.cut()
         grid = Grid.lay(first_modes(float(problem.span.max()) / (len(breaks) - 1), tolerance), breaks)
         start = Start(grid, ritz.guess(problem, grid))
-        answers, lost, steps = climb(problem, tolerance, start, sensitivities=sensitivities)
+        answers, lost, steps = climb(problem, tolerance, start, sensitivities=sensitivities, taut=relaxed)
         doubtful = [lost]
         folded = [lost] if relaxed else []
         for answer in answers:

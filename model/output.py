@@ -108,7 +108,7 @@ def _largest(grid: Grid, values: Array, ends: Array) -> tuple[Array, Array]:
     radius = np.where(ends[:, 0] >= ends[:, 1], np.exp(grid.breaks[0]), 1.0)
     kind, state = np.nonzero(values.max(axis=(1, 2)) > best)
     if len(state):
-        fine = np.einsum("fq,nqm->nmf", fine_table(grid.table.modes), values[kind, :, :, state])
+        fine = values[kind, :, :, state].swapaxes(1, 2) @ fine_table(grid.table.modes).T
         flat = fine.reshape(len(state), -1)
         top = flat.argmax(axis=1)
         element, place = np.divmod(top, FINE)

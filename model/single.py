@@ -140,7 +140,7 @@ class _Solver:
             self.count.electric += points
         products = [0.0] * (3 * points)
         vectors = [0.0] * (4 * points)
-        give = miss = 0.0
+        give = miss = rest = 0.0
         kept = []
         stable = True
         for i in range(points):
@@ -166,6 +166,7 @@ class _Solver:
                 b = field * exp(-2.0 * log3)
                 t1 -= b
                 t2 -= b
+                rest = max(rest, abs(b / t1))
                 b += b
                 h11 -= b
                 h12 -= b
@@ -215,6 +216,7 @@ class _Solver:
             if not change <= largest:
                 largest = change
             new.append(w[i] + dw)
+        largest *= math.sqrt(1.0 + rest)
         moved = [x + dx for x, dx in zip(c, dc, strict=True)]
         tail = moved[-1] ** 2 * diagonal[-1] + 0.1 * moved[-2] ** 2 * diagonal[-2]
         return moved, new, lam, largest, stable and positive, 0.5 * tail / (lam * film.height)

@@ -22,7 +22,7 @@ from model.law import Array, Stress, relax, stack, stress
 from model.ritz import Grid, Points, Problem, State
 
 FINE = 65  # points of an element where the sign of the hoop stress is read
-START_MODES = 8
+START_MODES = 5
 MOST_ZONES = 5
 ROUNDS = 4
 
@@ -58,7 +58,7 @@ def guess(problem: Problem, grid: Grid) -> State:
     return State(np.zeros((grid.unknowns, w.shape[2])), w, hoop, np.broadcast_to(folded, w.shape))
 
 
-def search(problem: Problem, grid: Grid, state: State, goal: float = 3e-3, limit: int = 30) -> Iterate:
+def search(problem: Problem, grid: Grid, state: State, goal: float = 2e-2, limit: int = 30) -> Iterate:
     """Newton with every point taut or wrinkled by itself: no order of convergence, but it finds the zones."""
     states = state.w.shape[2]
     steps = np.zeros(states, dtype=np.intp)
@@ -178,11 +178,11 @@ def settle(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
         new, change = ladder.advance(state, step, at, grid)
         assert at.law.relief is not None
         steps += 1
+        de, dq = grid.strain(step.dc)
+        # A cut that moves carries the strains with it: they must have settled as well as the slopes.
+        size = (np.abs(at.q) + state.w**2).max(axis=(0, 1))
+        change = np.maximum(change, np.abs(dq).max(axis=(0, 1)) / size)
         if m > 1:
-            de, dq = grid.strain(step.dc)
-            # A cut that moves carries the strains with it: they must have settled as well as the slopes.
-            size = (np.abs(at.q) + state.w**2).max(axis=(0, 1))
-            change = np.maximum(change, np.abs(dq).max(axis=(0, 1)) / size)
             tension = at.law.t2 + at.law.h12 * (at.along * dq + at.down * step.dw) + at.law.h22 * at.around * de
             breaks = grid.breaks.copy()
             length = grid.breaks[1:] - grid.breaks[:-1]
@@ -303,7 +303,7 @@ def _round(
                 continue
             film = part.take(of)
             breaks, wrinkled = _cut(film, zone.where[:changes, of], first)
-            modes = ladder.first_modes(0.7 * float((breaks[1:] - breaks[:-1]).max()), tolerance)
+            modes = max(3, ladder.first_modes(float((breaks[1:] - breaks[:-1]).max()), tolerance))
             begun = remap(film, Start(grid.take(of), chosen.take(of)), breaks, modes, wrinkled)
             done, missed, spent = ladder.climb(film, tolerance, begun, sensitivities=sensitivities, settle=settle)
             where = index[some[of]]
@@ -311,7 +311,9 @@ def _round(
             steps[where] += spent
             for answer in done:
                 solved = film.take(answer.index)
-                now = zones(answer.grid, answer.state, ritz.evaluate(solved, answer.grid, answer.state), slack=1e-6)
+                now = zones(
+                    answer.grid, answer.state, ritz.evaluate(solved, answer.grid, answer.state), slack=tolerance**0.5
+                )
                 same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
                 answer.index = where[answer.index]
                 answer.steps = steps[answer.index]

@@ -84,7 +84,7 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
     end = 1.0 if problem.film.field is None else 2.0
     begun = lowest(_at(problem, everyone, progress), grid, current)
     before, before_progress = State(current.c.copy(), current.w.copy()), progress.copy()
-    size = np.full(states, 0.25)
+    size = np.full(states, 0.5)
     while True:
         active = np.flatnonzero(alive & (progress < end))
         if len(active) == 0:
