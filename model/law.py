@@ -142,16 +142,22 @@ def relax(film: Film, law: Stress, where: NDArray[np.bool_]) -> Stress:
     around it.
     """
     film.count.relaxed += int(np.count_nonzero(where))
-    give = np.where(where, 1.0 / law.h22, 0.0)
+    keep = ~where
+    regular = law.h22 > 0.0
+    regular |= keep
+    give = where / law.h22
     rate = -law.h12 * give
     change = -law.t2 * give
-    keep = ~where
+    t1 = law.h12 * change
+    t1 += law.t1
+    h11 = law.h12 * rate
+    h11 += law.h11
     return Stress(
-        t1=law.t1 + law.h12 * change,
+        t1=t1,
         t2=law.t2 * keep,
-        h11=law.h11 + law.h12 * rate,
+        h11=h11,
         h12=law.h12 * keep,
         h22=law.h22 * keep,
         maxwell=law.maxwell,
-        relief=Relief(change, rate, np.logical_or(law.h22 > 0.0, keep)),
+        relief=Relief(change, rate, regular),
     )

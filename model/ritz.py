@@ -50,10 +50,15 @@ class Table:
     end_slopes: Array  # (2, Q): derivative there
 
 
+@lru_cache(maxsize=64)
+def _barycentric_weights(points: int) -> Array:
+    xi, weight = np.polynomial.legendre.leggauss(points)
+    return np.asarray((-1.0) ** np.arange(points) * np.sqrt((1.0 - xi * xi) * weight))
+
+
 def barycentric(xi: Array, at: Array) -> Array:
     """Matrix (len(at), len(xi)) of polynomial interpolation from the Gauss points ``xi`` to ``at``."""
-    _, weight = np.polynomial.legendre.leggauss(len(xi))
-    lam = (-1.0) ** np.arange(len(xi)) * np.sqrt((1.0 - xi * xi) * weight)
+    lam = _barycentric_weights(len(xi))
     gap = at[:, None] - xi[None, :]
     hit = gap == 0.0
     ratio = lam / np.where(hit, 1.0, gap)
@@ -205,11 +210,19 @@ class Grid:
             products = t.pairs[: n * (n + 1) // 2] @ stacked.reshape(3 * t.points, states)
             return products[t.square[:n, :n]]
         products = (t.pairs @ stacked.reshape(3 * t.points, -1)).reshape(-1, m, states)
-        local = products[t.square]  # (N+2, N+2, M, S)
-        out = np.zeros((self.unknowns + 1, self.unknowns + 1, states))
-        for element, place in enumerate(places(t.modes, m)):
-            out[np.ix_(place, place)] += local[:, :, element]
-        return out[:-1, :-1]
+        n, size = t.modes, self.unknowns
+        out = np.zeros((size, size, states))
+        for element in range(m):
+            own = slice(element * n, (element + 1) * n)
+            out[own, own] = products[t.square[:n, :n], element]
+            left, right = m * n + element - 1, m * n + element
+            for hat, cut in ((n, left), (n + 1, right)):
+                if m * n <= cut < size:
+                    out[own, cut] = out[cut, own] = products[t.square[:n, hat], element]
+                    out[cut, cut] += products[t.square[hat, hat], element]
+            if m * n <= left and right < size:
+                out[left, right] = out[right, left] = products[t.square[n, n + 1], element]
+        return out
 
 
 @dataclass(slots=True)
