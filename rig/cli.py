@@ -136,12 +136,13 @@ def sim(scene: Path) -> None:
 @click.option("-o", "--out", type=FILE, help="Result as JSON.")
 @click.option("--report", type=FILE, help="Result as one self-contained HTML page.")
 @click.option("--terms", type=click.IntRange(1, 3), default=2, show_default=True, help="Ogden terms.")
-def fit(logs: tuple[Path, ...], out: Path | None, report: Path | None, terms: int) -> None:
+@click.option("--profiles", is_flag=True, help="95 % intervals from profile likelihood too; takes longer.")
+def fit(logs: tuple[Path, ...], out: Path | None, report: Path | None, terms: int, profiles: bool) -> None:
     """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties."""
     from rig.identification import identify_logs, write_results
     from rig.tables import identification_table, show
 
-    found = identify_logs(list(logs), terms=terms)
+    found = identify_logs(list(logs), terms=terms, profiles=profiles)
     write_results(found, out, report)
     show(identification_table(found.identification))
     for path in (out, report):

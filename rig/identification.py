@@ -33,8 +33,10 @@ class Found:
     truth: Material | None
 
 
-def identify_logs(paths: Sequence[Path], *, terms: int = 2) -> Found:
+def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = False) -> Found:
     """Identify the film from all recorded curves of all logs at once.
+
+    ``profiles`` adds 95 % intervals from profile likelihood, which take a few seconds more.
 
     Raises
     ------
@@ -53,7 +55,7 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2) -> Found:
             curves += run.curves(scene.specimen.specimen(), **_errors(run, scene))
         if not curves:
             raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
-        identification = identify(curves, terms=terms, provenance=provenance)
+        identification = identify(curves, terms=terms, profiles=profiles, provenance=provenance)
     except (CurveError, IdentificationError, CertificateError) as error:
         raise DataError(f"{error}.") from None
     return Found(identification, curves, runs, provenance, _truth(scenes))

@@ -85,6 +85,7 @@ def identification_table(found: Identification) -> Group:
         f"secant shear modulus at stretches {found.stretch[0]:.2f} (meridional) and {found.stretch[1]:.2f} (hoop).",
     ]
     lines += [f"note: {warning}" for warning in found.warnings]
+    lines += [f"advice: {advice}" for advice in found.advice]
     return Group(*lines)
 
 
