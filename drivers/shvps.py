@@ -10,7 +10,8 @@ No line says what it answers, and numbers look alike. After each number the driv
 (``slave 8``) looks like no number: a doubled or late number meets that question and is dropped, and since answers
 keep their order no old one can come after it.
 There is no checksum: a digit may change unseen. Commands are read back; a voltage above 1.2 times the maximum is not
-believed.
+believed; a set-point or state other than expected is believed when it has been read twice, since the ramp goes on from
+the set-point.
 There is no ramp: the set-point is moved in steps at the polling rate. When the host dies, the voltage stays.
 The current is not measured (NaN) and not limited beyond what the converter can give: `set_current_limit` refuses.
 There is no latch: an emergency off is remembered here, until `clear`.
@@ -114,7 +115,7 @@ class Shvps:
         self.name = name
         self.identity = Identity()
         self.settings: dict[str, str] = {}
-        self.counters: dict[str, int] = {"implausible": 0, "unexpected_replies": 0}
+        self.counters: dict[str, int] = {"implausible": 0, "doubted": 0, "unexpected_replies": 0}
         self._label = label(name, link)
         self._link = link
         self._codec = Codec(self.counters)
@@ -271,6 +272,19 @@ class Shvps:
             "Check that no other program, button or external input controls it.",
         )
 
+    def _confirmed(self, request: str, expected: int) -> _Part[int]:
+        """The number as expected, or another one that was read twice."""
+        seen = {expected}
+        for _ in range(TRIES + 1):
+            number = yield from self._number(request)
+            if number in seen:
+                return number
+            self.counters["doubted"] += 1
+            seen.add(number)
+        raise DeviceRefused(
+            self._label, f"{request} is answered differently each time", "Check cable, grounding and shielding."
+        )
+
     def _set_up(self) -> Script[str, str]:
         version = _VERSION.fullmatch((yield Ask("QVer")).message)
         assert version is not None
@@ -280,8 +294,8 @@ class Shvps:
             )
         name = (yield from self._ask("QName")).message
         max_volts = yield from self._number("QVmax")
-        setpoint = yield from self._number("QVset")
-        mode = yield from self._number("QSwMode")
+        setpoint = yield from self._confirmed("QVset", 0)
+        mode = yield from self._confirmed("QSwMode", OFF)
         needs_jack = yield from self._number("QPowJack")
         jack = yield from self._number("QJack")
         if not 0 < max_volts <= 20_000:
@@ -306,8 +320,8 @@ class Shvps:
         if self._on and self._setpoint != self._target:
             yield from self._step()
         answer = yield from self._ask("QVnow")
-        self._setpoint = yield from self._number("QVset")
-        mode = yield from self._number("QSwMode")
+        self._setpoint = yield from self._confirmed("QVset", self._setpoint)
+        mode = yield from self._confirmed("QSwMode", STEADY if self._on else OFF)
         self._on = mode != OFF
         flags = HVFlag(0)
         if self._on:

@@ -369,12 +369,16 @@ class Engine:
             now = self.clock.now()
             if guard is not None and not hastened and (self._stop.count >= 2 or "hv" in lost):
                 hastened = True
-                guard.kill(f"{cause}; hastened")
+                lost.discard("hv")  # whatever it met on the way down: the emergency off goes out with the next poll
+                try:
+                    guard.kill(f"{cause}; hastened")
+                except DeviceError as error:
+                    self.recorder.event("error", "hv", str(error))
             for role, device in self.bench.devices.items():
                 if role not in lost:
                     self._poll_to_the_end(role, device.poll, self.clock.now(), lost)
             still = "stage" in lost or not self.bench.stage.moving
-            off = guard is None or guard.output_is_safe or "hv" in lost
+            off = guard is None or guard.output_is_safe or (hastened and "hv" in lost)
             if still and off:
                 break
             self.recorder.tick(now)

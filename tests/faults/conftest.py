@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration.certificate import load_certificate
 from drivers.link import DeviceError
 from rig.bench import Bench
 from rig.engine import Engine, Outcome
@@ -24,7 +25,7 @@ from rig.signals import StopRequest
 from rig.sim.bench import SimulatedBench
 from rig.toml_file import parse_table
 
-SCENE = Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml"
+SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 PROTOCOL = """
 [[step]]
 do = "home"
@@ -83,21 +84,26 @@ Tell = Callable[..., Story]
 
 @pytest.fixture
 def tell(tmp_path: Path) -> Tell:
-    """``tell(mischief, replace)`` runs the short protocol on the simulated bench.
+    """``tell(mischief, replace, scene)`` runs the short protocol on the simulated bench.
 
     ``mischief(bench, stop)`` is called once, with 1000 V on and the stage moving. ``replace`` is (old, new) in the
-    scene's text. The story tells the supply's true output about five times a second.
+    text of the scene, which is named as among the fixtures. The story tells the supply's true output about five times
+    a second.
     """
 
-    def run(mischief: Mischief | None = None, *, replace: tuple[str, str] | None = None) -> Story:
-        text = SCENE.read_text()
+    def run(
+        mischief: Mischief | None = None, *, replace: tuple[str, str] | None = None, scene: str = "cone-4mm"
+    ) -> Story:
+        text = (SCENES / f"{scene}.toml").read_text()
         if replace is not None:
             assert replace[0] in text
             text = text.replace(*replace)
-        scene = parse_table(text, Scene, "scene", "test")
-        actions = plan(parse_table(PROTOCOL, Protocol, "protocol", "test"), scene)
-        check_plan(actions, scene)
-        bench = Bench(scene)
+        parsed = parse_table(text, Scene, "scene", "test")
+        actions = plan(parse_table(PROTOCOL, Protocol, "protocol", "test"), parsed)
+        check_plan(actions, parsed)
+        certificate = load_certificate(SCENES / parsed.force.certificate)
+        gains = Gains(force=certificate.gain, force_unit=certificate.reading_unit)
+        bench = Bench(parsed)
         assert bench.simulated is not None
         simulated, clock, stop = bench.simulated, bench.clock, StopRequest()
         outputs: list[tuple[float, float]] = []
@@ -114,7 +120,7 @@ def tell(tmp_path: Path) -> Tell:
 
         path = tmp_path / "run.mcap"
         with LogWriter(path) as log:
-            engine = Engine(bench, actions, log, Gains(force=0.5), stop, progress)
+            engine = Engine(bench, actions, log, gains, stop, progress)
             outcome, error = engine.run()
             bench.close()
             if not engine.recorder.log_failed:

@@ -1,0 +1,130 @@
+"""A CAN load cell and a serial supply without current monitor or trip flags: the same faults, the same safe ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+
+from drivers.link import DeviceError, DeviceLost
+from rig.errors import FaultError, LimitError
+from rig.log.reader import read_log
+from rig.signals import StopRequest
+from rig.sim.bench import SimulatedBench
+from rig.sim.settings import Fault
+
+Tell = Callable[..., Any]  # of conftest.Story
+AT_ONCE_S = 1.5
+
+
+@pytest.fixture
+def tell_other(tell: Tell) -> Tell:
+    return partial(tell, scene="other-instruments")
+
+
+def inject(role: str, kind: str, **more: Any) -> Callable[[SimulatedBench, StopRequest], None]:
+    return lambda bench, stop: bench.inject(Fault(role=role, kind=kind, **more))
+
+
+@pytest.mark.parametrize("kind", ["vanish", "silent", "reset", "saturate", "freeze", "wrong_status"])
+def test_a_load_cell_that_fails_ends_the_run_off(tell_other: Tell, kind: str) -> None:
+    story = tell_other(inject("force", kind))
+    assert isinstance(story.error, (DeviceError, FaultError, LimitError)), story.error
+    assert story.outcome.status in ("fault", "limit") and "force" in story.outcome.reason
+    assert story.outcome.safe and abs(story.final_output) < 60 and story.took < 1.0 + AT_ONCE_S
+    assert story.control_words[-1] == "emergency_off"
+
+
+def test_a_supply_that_vanishes_is_called_not_safe(tell_other: Tell) -> None:
+    story = tell_other(inject("hv", "vanish"))
+    assert isinstance(story.error, DeviceLost) and not story.outcome.safe
+    assert story.final_output > 900  # it has no watchdog; only hardware helps
+
+
+def test_a_supply_that_falls_silent_still_gets_the_command_but_nothing_proves_it(tell_other: Tell) -> None:
+    story = tell_other(inject("hv", "silent"))
+    assert isinstance(story.error, (DeviceError, FaultError)) and not story.outcome.safe
+    assert abs(story.final_output) < 60
+
+
+def test_a_supply_that_ignores_off_is_called_not_safe(tell_other: Tell) -> None:
+    story = tell_other(inject("hv", "stuck_on"))
+    assert story.final_output > 900 and not story.outcome.safe
+    events = [message.fields["message"] for message in read_log(story.log).messages("/event")]
+    assert any(text.startswith("NOT SAFE") for text in events)
+
+
+@pytest.mark.parametrize("kind", ["breakdown", "over_current", "sag"])
+def test_without_a_current_monitor_a_failing_film_shows_in_the_voltage(tell_other: Tell, kind: str) -> None:
+    story = tell_other(inject("hv", kind))
+    assert isinstance(story.error, FaultError) and "sagged" in str(story.error), story.error
+    assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S
+
+
+@pytest.mark.parametrize(("kind", "words"), [("wrong_status", "says that it is off"), ("reset", "")])
+def test_a_supply_that_goes_off_by_itself_ends_the_run(tell_other: Tell, kind: str, words: str) -> None:
+    story = tell_other(inject("hv", kind))
+    assert isinstance(story.error, (DeviceError, FaultError)) and words in str(story.error), story.error
+    assert story.outcome.status == "fault" and abs(story.final_output) < 60
+
+
+def watch_targets(bench: SimulatedBench, targets: list[float]) -> None:
+    """Write down every voltage that the supply is driven to from now on."""
+    output = bench.world.output
+    drive = output.ramp
+
+    def ramp(t: float, target: float, rate: float) -> None:
+        targets.append(target)
+        drive(t, target, rate)
+
+    output.ramp = ramp  # type: ignore[method-assign]
+
+
+def test_lines_doubled_torn_and_late_change_nothing(tell_other: Tell) -> None:
+    targets: list[float] = []
+
+    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+        watch_targets(bench, targets)
+        for kind in ("duplicate", "split", "delay"):
+            bench.inject(Fault(role="hv", kind=kind, value=0.02, probability=0.2))
+
+    story = tell_other(mischief)
+    assert story.error is None, story.error
+    assert story.outcome.safe and story.final_output == 0.0
+    assert max(targets) <= 1000.5 and len(targets) > 20
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_damaged_answers_never_raise_the_voltage(tell_other: Tell, seed: int) -> None:
+    """There is no checksum: whatever a damaged digit says, it must not become a set-point."""
+    targets: list[float] = []
+
+    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+        watch_targets(bench, targets)
+        bench.inject(Fault(role="hv", kind="corrupt", probability=0.1))
+        stop.ask("a test")  # so that the ramp down is what meets the damage
+
+    story = tell_other(mischief, replace=("seed = 4", f"seed = {seed}"))
+    assert len(targets) > 10 and max(targets) <= 1000.5
+    assert story.final_output < 60
+
+
+def test_a_supply_found_live_is_reported_and_left_alone(tell_other: Tell) -> None:
+    story = tell_other(replace=("[simulation.hv]", "[simulation.hv]\nstart_live_V = 500.0"))
+    assert isinstance(story.error, FaultError) and "cannot be armed" in story.outcome.reason
+    assert story.final_output == pytest.approx(500, abs=5) and not story.outcome.safe
+    assert not {"set_voltage", "switch_off", "emergency_off"} & set(story.control_words)
+
+
+@pytest.mark.parametrize("scene", ["cone-4mm", "other-instruments"])
+def test_an_error_during_the_ramp_down_does_not_keep_the_emergency_off_from_being_sent(tell: Tell, scene: str) -> None:
+    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+        stop.ask("a test")
+        bench.inject(Fault(role="hv", kind="silent", at_s=bench.now + 0.5))
+
+    story = tell(mischief, scene=scene)
+    assert story.outcome.status == "stopped" and not story.outcome.safe
+    assert story.control_words[-2:] == ["switch_off", "emergency_off"]
+    assert abs(story.final_output) < 60
