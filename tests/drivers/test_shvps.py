@@ -339,3 +339,26 @@ def test_any_split_decodes_to_the_same_lines(lines: list[bytes], data: st.DataOb
     got = [m for a, b in zip([0, *cuts], [*cuts, len(wire)], strict=True) for m in pieces.feed(wire[a:b])]
     assert got == expected and pieces.counters == whole.counters
     assert all(line.isprintable() for line in got)
+
+
+@pytest.mark.parametrize(("word", "damaged"), [("QVset", b"9000\r\n"), ("QVset", b"3\r\n"), ("QSwMode", b"0\r\n")])
+def test_a_damaged_answer_does_not_move_the_set_point(live: Bench, word: str, damaged: bytes) -> None:
+    """A ramp goes on from the set-point: an answer that was damaged once must not become that."""
+    original = live.fake.write
+    spoiled: list[bytes] = []
+    watching = False  # in the polling cycle, not while a set-point is read back
+
+    def write(data: bytes) -> None:
+        nonlocal watching
+        original(data)
+        watching = (watching or data == b"QVnow\r") and not data.startswith(b"S")
+        if watching and not spoiled and data == word.encode() + b"\r":
+            spoiled.append(live.fake.out)
+            live.fake.out = damaged
+
+    live.supply.set_voltage(1100.0)
+    live.fake.write = write  # type: ignore[method-assign]
+    live.run(1.0)
+    assert spoiled
+    assert live.fake.history == sorted(live.fake.history) and max(live.fake.history) == 1097
+    assert {sample.flags & HVFlag.ON for sample in live.samples} == {HVFlag.ON}
