@@ -57,8 +57,10 @@ pdo.add_callback(lambda message: seen.append([v.raw for v in message]))
 node.nmt.state = "OPERATIONAL"
 node.nmt.wait_for_heartbeat(2.0)
 out["state"] = node.nmt.state
+seen.clear()
+begin = time.monotonic()
 time.sleep(1.0)
-out["before"] = seen[:]
+out["before"], out["lasted"] = seen[:], time.monotonic() - begin
 node.sdo[0x6125][1].raw = int.from_bytes(b"zero", "little")
 time.sleep(0.1)
 seen.clear()
@@ -79,6 +81,7 @@ def test_canopen_maps_starts_and_tares(serve: Callable[..., Any]) -> None:
     assert out["type"] == 0x0002_0194 and out["serial"] == 77_120 and out["name"] == "simulated load cell"
     assert out["unit"] == struct.unpack("<I", bytes.fromhex("00002100"))[0]
     assert out["state"] == "OPERATIONAL"
-    assert 40 <= len(out["before"]) <= 55 and all(sample == [123, 0] for sample in out["before"])
+    assert len(out["before"]) == pytest.approx(out["lasted"] / 0.02, rel=0.1)
+    assert all(sample == [123, 0] for sample in out["before"])
     assert len(out["after"]) >= 15 and all(sample == [0, 0] for sample in out["after"])
     assert out["abort"] == 0x0601_0002
