@@ -51,8 +51,8 @@ def first_modes(span: float, tolerance: float) -> int:
 
 
 def goal(tolerance: float) -> float:
-    """Change of a slope at which Newton's error is half the tolerance."""
-    return min(0.03, max(1e-6, math.sqrt(0.5 * tolerance / NEWTON_FACTOR)))
+    """Change of a slope at which Newton's error is just below the tolerance."""
+    return min(0.03, max(1e-6, math.sqrt(0.9 * tolerance / NEWTON_FACTOR)))
 
 
 Number = TypeVar("Number", float, Array)

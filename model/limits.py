@@ -185,7 +185,8 @@ def _root(
         width = high2 - low2
         if not np.any(width > tolerance * high2):
             break
-        share = np.where((at_low > 0.0) & (at_high < 0.0), at_low / (at_low - at_high), 0.5)
+        bracketed = (at_low > 0.0) & (at_high < 0.0)
+        share = np.where(bracketed, at_low / np.where(bracketed, at_low - at_high, 1.0), 0.5)
         # A known sign change is closed in from both sides: a step never leaves less than a hundredth of the tolerance.
         edge = np.minimum(0.5, 0.4 * tolerance * high2 / np.where(width > 0.0, width, 1.0))
         share = np.clip(np.where(n % 4 == 3, 0.5, share), edge, 1.0 - edge)
