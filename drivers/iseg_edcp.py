@@ -481,6 +481,8 @@ class IsegEDCP:
         self._command(self._switch_on())
 
     def switch_off(self) -> None:
+        self._dialogue.clear()  # nothing that was queued before may switch on after it
+        self._commands = 0
         self._command(self._switch_off())
 
     def emergency_off(self) -> None:

@@ -186,6 +186,8 @@ class Shvps:
 
     def switch_off(self) -> None:
         self._require_ready()
+        self._dialogue.clear()  # nothing that was queued before may switch on after it
+        self._commands = 0
         self._command(self._switch_off())
 
     def emergency_off(self) -> None:

@@ -7,6 +7,7 @@ instruments and checks the limits between two turns. An action that takes much l
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from drivers.roles import DisplacementSample, ForceSample, HVFlag, Sample, StageSample
 from rig.errors import FaultError, LimitError
 from rig.plan import Action
-from rig.safety.guard import check_path
+from rig.watch import check_zero
 
 if TYPE_CHECKING:
     from rig.engine import Engine
@@ -29,6 +30,7 @@ GRACE_S = 10.0
 CONTACT_WINDOW_S = 0.25  # force is averaged over this long before it is held against the contact threshold
 CONTACT_SIGMAS = 4.0  # the threshold must exceed the noise of that average this many times
 HOMING_LIMIT_S = 90.0
+ARRIVAL_M = 50e-6  # a stage that says it is done must be this near to where it was sent
 
 
 def carry_out(engine: Engine, action: Action) -> Turns:
@@ -88,7 +90,9 @@ def _zero(engine: Engine, action: Action) -> Turns:
 
     with _listening(engine, listen):
         yield from _pause(engine, action.parameters["duration"])
-    recorder.force_zero, error = _mean(force, "force")
+    zero, error = _mean(force, "force")
+    check_zero(engine.limits, engine.gains.force * zero)
+    recorder.force_zero = zero
     engine.force_noise = error * math.sqrt(len(force)) * engine.gains.force
     recorder.reference("force_zero", recorder.force_zero, error, engine.bench.force.reading_unit)
     if recorder.has_laser:
@@ -121,8 +125,24 @@ def _approach(engine: Engine, action: Action) -> Turns:
             f"give threshold_mN of at least {needed * 1e3:.2g}."
         )
     start = action.parameters["start"]
-    engine.move_stage(start, action.parameters["fast"])
-    yield from _wait(engine, lambda: not stage.moving, _patience(action), "The stage's way to where approaching begins")
+    newest: deque[float] = deque(maxlen=n)
+
+    def feel(sample: Sample) -> None:
+        if isinstance(sample, ForceSample):
+            newest.append(recorder.quantity_of(sample))
+
+    def met_already() -> bool:
+        return len(newest) == n and not abs(float(np.mean(newest))) <= threshold
+
+    with _listening(engine, feel):
+        engine.move_stage(start, action.parameters["fast"])
+        way_there = "The stage's way to where approaching begins"
+        yield from _wait(engine, lambda: not stage.moving or met_already(), _patience(action), way_there)
+    if met_already():
+        raise FaultError(
+            f"The pusher met something before {start * 1e3:g} mm, where approaching was to begin. "
+            "Give the scene a smaller stage.approach_from_mm."
+        )
     goal = min(start + action.parameters["max_travel"], stage.travel[1])
     way: list[tuple[float, float]] = []  # time and position of the stage
     met: list[tuple[float, float]] = []  # time and force
@@ -136,7 +156,9 @@ def _approach(engine: Engine, action: Action) -> Turns:
     with _listening(engine, listen):
         engine.move_stage(goal, action.speed)
         end = engine.clock.now() + _patience(action)
-        while not (len(met) >= n and np.mean([force for _, force in met[-n:]]) > threshold):
+        while not (mean := _mean_of_last(met, n)) > threshold:
+            if mean < -threshold:
+                raise FaultError(f"The force fell to {mean * 1e3:.1f} mN on the way to contact: its sign is wrong.")
             if not stage.moving or engine.clock.now() > end:
                 raise FaultError(
                     f"The film was not met within {action.parameters['max_travel'] * 1e3:g} mm of travel. "
@@ -149,10 +171,17 @@ def _approach(engine: Engine, action: Action) -> Turns:
         recorder.contact, error = yield from _contact_by_laser(engine)
     else:
         times, forces = np.array(met).T
-        recorder.contact, error = _corner(np.interp(times, *np.array(way).T), forces)
+        where = np.interp(times, *np.array(way).T)
+        recorder.contact, error = _corner(where, forces)
+        if recorder.contact <= where.min():
+            raise FaultError("The force rose from the very beginning of the approach: contact was before it.")
     recorder.reference("contact_position", recorder.contact, error, "m")
-    engine.move_to(0.0, action.speed, 0.0)
-    yield from _wait(engine, lambda: not stage.moving, GRACE_S, "The return to the contact position")
+    yield from _go(engine, 0.0, action.speed, GRACE_S)
+
+
+def _mean_of_last(met: list[tuple[float, float]], n: int) -> float:
+    """Mean of the last ``n`` forces; 0 while there are fewer."""
+    return float(np.mean([force for _, force in met[-n:]])) if len(met) >= n else 0.0
 
 
 def _contact_by_laser(engine: Engine) -> Generator[None, None, tuple[float, float]]:
@@ -191,16 +220,29 @@ def _hold(engine: Engine, action: Action) -> Turns:
 
 
 def _move_or_voltage(engine: Engine, action: Action) -> Turns:
-    if action.voltage[0] != action.voltage[1]:
+    if "settle" in action.parameters:
         yield from _set_voltage(engine, action)
     elif action.moves:
         yield from _move(engine, action)
 
 
 def _move(engine: Engine, action: Action) -> Turns:
-    stage = engine.bench.stage
-    engine.move_to(action.h[1], action.speed, action.voltage[1])
-    yield from _wait(engine, lambda: not stage.moving, _patience(action), "The end of the stage's move")
+    yield from _go(engine, action.h[1], action.speed, _patience(action))
+
+
+def _go(engine: Engine, h: float, speed: float, limit: float) -> Turns:
+    """Move to displacement ``h`` and make sure that the stage says it is there."""
+    stage, recorder = engine.bench.stage, engine.recorder
+    engine.move_to(h, speed)
+    yield from _wait(engine, lambda: not stage.moving, limit, "The end of the stage's move")
+    yield from _pause(engine, 2 / engine.bench.scene.stage.poll_rate_Hz)
+    assert recorder.stage is not None
+    missed = recorder.stage.position - (recorder.contact + h)
+    if not abs(missed) <= ARRIVAL_M:
+        raise FaultError(
+            f"stage: it stands {missed * 1e3:+.3f} mm from where it was sent, and says that it is done. "
+            "Did something stop it?"
+        )
 
 
 def _set_voltage(engine: Engine, action: Action) -> Turns:
@@ -223,7 +265,7 @@ def _set_voltage(engine: Engine, action: Action) -> Turns:
 
 
 def _return(engine: Engine, action: Action) -> Turns:
-    if action.voltage[0] != action.voltage[1]:
+    if "settle" in action.parameters:
         yield from _set_voltage(engine, action)
         return
     yield from _move(engine, action)
@@ -237,9 +279,3 @@ _BY_KIND: dict[str, Callable[[Engine, Action], Turns]] = {
     "hold": _hold,
     "return": _return,
 }
-
-
-def film_checked(engine: Engine, h: float, voltage: float) -> None:
-    """Check the film from where it is to displacement ``h`` at ``voltage``, when there is voltage to check."""
-    here = engine.recorder.displacement
-    check_path(engine.film, here if math.isfinite(here) else 0.0, h, voltage)

@@ -6,6 +6,7 @@ The same drivers sit on real ports and on the simulated bench in memory; only th
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from drivers.link import ByteLink, CanFrame, FrameLink
@@ -211,12 +212,13 @@ class Bench:
                     self.devices[role] = self.hv
 
     def close(self) -> None:
-        """Close every device and link, whatever state they are in."""
-        for device in self.devices.values():
-            device.close()
-        links: list[ByteLink | FrameLink] = [*self._byte_links.values(), *self._frame_links.values()]
-        for link in links:
-            link.close()
+        """Close every device and link, whatever state they are in; one that fails does not keep the others open."""
+        closing = [device.close for device in self.devices.values()]
+        closing += [link.close for link in self._byte_links.values()]
+        closing += [link.close for link in self._frame_links.values()]
+        for close in closing:
+            with suppress(Exception):
+                close()
 
 
 def simulated_bench(scene: Scene) -> SimulatedBench:

@@ -14,14 +14,16 @@ from calibration.certificate import Certificate, CertificateError, load_certific
 from rig.bench import Bench
 from rig.clock import Clock, calendar_now
 from rig.engine import Engine, Outcome
-from rig.errors import ConfigError
+from rig.errors import ConfigError, FaultError
 from rig.log.writer import LogWriter
 from rig.plan import Action, Prediction, check_plan, plan
 from rig.protocol import Protocol, load_protocol
 from rig.recorder import Gains
 from rig.scene import Scene, load_scene
 from rig.signals import stop_on_signals
+from rig.teardown import ADVICE
 
+IN_MEMORY = "simulated in memory"  # in a log's metadata: its truth is that of its own scene
 RECORDED_PACKAGES = ("dea-rig", "numpy", "scipy", "mcap", "protobuf", "pydantic", "pyserial", "python-can")
 
 
@@ -80,28 +82,29 @@ def run(experiment: Experiment, out: Path, progress: Callable[[float, float, str
         outcome as a note.
     """
     bench = Bench(experiment.scene)
+    outcome: Outcome | None = None
     try:
         problems = _check_dates(experiment.certificates, bench.clock)
         with LogWriter(out) as log, stop_on_signals() as stop:
             _attach(log, experiment, problems)
-            engine = Engine(bench, experiment.actions, log, _gains(experiment.certificates), stop, progress)
+            certificates = experiment.certificates
+            engine = Engine(bench, experiment.actions, log, _gains(certificates), stop, progress, certificates)
             outcome, error = engine.run()
             bench.close()  # before the log ends: closing a device may say a last word on its wire
             if not engine.recorder.log_failed:
                 log.finish(outcome.as_text())
+        if error is None and not outcome.safe:
+            error = FaultError(f"The protocol ended, but the high voltage could not be proved off. {ADVICE}")
+        if error is not None:
+            raise error
+    except Exception as error:
+        if outcome is not None:
+            error.add_note(f"State of the rig: {outcome.state}.{'' if outcome.safe else ' ' + ADVICE}")
+            error.add_note(f"The log so far: {out if out.exists() else log.part}")
+        raise
     finally:
         bench.close()
-    if error is not None:
-        error.add_note(_how_it_ended(outcome))
-        error.add_note(f"The log so far: {out if out.exists() else log.part}")
-        raise error
     return outcome
-
-
-def _how_it_ended(outcome: Outcome) -> str:
-    """The state of the rig, for the operator."""
-    advice = "" if outcome.safe else " Keep away, switch the supply off at its mains switch, use the grounding stick."
-    return f"The stage was told to stop; {outcome.state}.{advice}"
 
 
 def _certificates(scene: Scene, folder: Path) -> dict[str, Certificate]:
@@ -122,7 +125,7 @@ def _certificates(scene: Scene, folder: Path) -> dict[str, Certificate]:
 
 
 def _check_dates(certificates: dict[str, Certificate], clock: Clock) -> list[str]:
-    """Problems with the certificates' dates; serial numbers are checked once the instruments have answered."""
+    """Problems with the certificates' dates; the engine checks serial numbers once the instruments have answered."""
     today = datetime.fromtimestamp(clock.epoch_ns(clock.now()) * 1e-9, UTC).date()
     return [problem for certificate in certificates.values() for problem in certificate.check("", today)]
 
@@ -146,7 +149,7 @@ def _attach(log: LogWriter, experiment: Experiment, problems: list[str]) -> None
             "scene": experiment.scene.title,
             "protocol": experiment.protocol.title,
             "specimen": experiment.scene.specimen.name,
-            "bench": "real ports" if experiment.scene.on_real_ports else "simulated in memory",
+            "bench": "real ports" if experiment.scene.on_real_ports else IN_MEMORY,
             "without_certificate": " ".join(role for role in uncalibrated if role != "stage"),
             "certificate_problems": "; ".join(problems),
         },

@@ -14,6 +14,7 @@ from calibration.identify import IdentificationError, identify
 from calibration.result import Identification
 from model.materials import Material
 from rig.errors import ConfigError, DataError
+from rig.experiment import IN_MEMORY
 from rig.log.dataset import CurveErrors, Run, load_run
 from rig.scene import Scene
 from rig.toml_file import parse_table
@@ -46,8 +47,8 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
     runs = [load_run(path) for path in paths]
     scenes = [parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)") for run in runs]
     provenance: dict[str, object] = {
-        "logs": {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths},
-        "outcomes": {run.log.path.name: (run.log.outcome or {}).get("status", "cut off") for run in runs},
+        "logs": {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths},
+        "outcomes": {str(run.log.path): (run.log.outcome or {}).get("status", "cut off") for run in runs},
     }
     curves: list[Curve] = []
     try:
@@ -58,7 +59,7 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
         identification = identify(curves, terms=terms, profiles=profiles, provenance=provenance)
     except (CurveError, IdentificationError, CertificateError) as error:
         raise DataError(f"{error}.") from None
-    return Found(identification, curves, runs, provenance, _truth(scenes))
+    return Found(identification, curves, runs, provenance, _truth(runs, scenes))
 
 
 def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
@@ -151,10 +152,12 @@ def _certificates(run: Run) -> dict[str, Certificate]:
     return found
 
 
-def _truth(scenes: Sequence[Scene]) -> Material | None:
+def _truth(runs: Sequence[Run], scenes: Sequence[Scene]) -> Material | None:
+    if any(run.log.metadata.get("run", {}).get("bench") != IN_MEMORY for run in runs):
+        return None
     truths = set()
     for scene in scenes:
-        if scene.simulation is None or scene.on_real_ports:
+        if scene.simulation is None:
             return None
         film, believed = scene.simulation.film, scene.specimen.specimen().material
         truths.add(

@@ -116,6 +116,10 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
                 parameters={"duration": step.duration_s},
             )
         elif isinstance(step, steps.Approach):
+            if contact or v > 0:
+                raise LimitError(
+                    f"Step {number} (approach) comes in contact or with voltage; put a return step before."
+                )
             if not (homed and zeroed):
                 raise LimitError(f"Step {number} (approach) needs a home and a zero step before it.")
             contact = True
@@ -159,6 +163,7 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
             start, top, speed = step.from_mm * 1e-3, step.displacement_mm * 1e-3, step.speed_mm_per_s * 1e-3
             if not start < top:
                 raise LimitError(f"Step {number} (sweep): from_mm must be smaller than displacement_mm.")
+            passes: dict[float, int] = {}
             for level in step.voltages_V:
                 if h != start:
                     yield move_to(number, kind, start, speed, 0, record=False)
@@ -166,7 +171,10 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
                 if level != v:
                     yield voltage_to(number, kind, level, step.settle_s)
                     v = level
-                for cycle in range(1, step.cycles + 1):
+                # A level that comes again goes on counting its cycles.
+                first = passes.get(level, 0) + 1
+                passes[level] = first + step.cycles - 1
+                for cycle in range(first, first + step.cycles):
                     for target in (top, start):
                         yield move_to(number, kind, target, speed, cycle, record=True)
                         h = target

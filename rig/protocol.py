@@ -20,7 +20,7 @@ Cycles = Annotated[int, Field(ge=1, le=1000)]
 
 
 class Home(Table):
-    """Let the stage find its reference position, with the voltage off."""
+    """Let the stage find its reference position, before anything is in contact."""
 
     do: Literal["home"]
 
@@ -86,7 +86,7 @@ class Sweep(Table):
 
 
 class Return(Table):
-    """Voltage off, then the pusher back from the film."""
+    """Voltage to zero, then the pusher back from the film."""
 
     do: Literal["return"]
     speed_mm_per_s: Positive = 2.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample, StageSample
@@ -35,7 +35,7 @@ class Recorder:
     ``force`` and ``displacement`` are NaN until their references are known.
     """
 
-    def __init__(self, log: LogWriter, clock: Clock, gains: Gains) -> None:
+    def __init__(self, log: LogWriter, clock: Clock, gains: Gains, *, has_laser: bool) -> None:
         self._log = log
         self._clock = clock
         self._gains = gains
@@ -46,8 +46,9 @@ class Recorder:
         self.force_zero = math.nan
         self.displacement_zero = math.nan
         self.contact = math.nan
-        self.has_laser = False
+        self.has_laser = has_laser
         self.log_failed = False
+        self.best_effort = False  # on the way to the safe state a log that fails is no reason to stop
 
     @property
     def force(self) -> float:
@@ -69,8 +70,14 @@ class Recorder:
             return self._gains.force * (sample.reading - self.force_zero)
         return self._gains.displacement * (sample.displacement - self.displacement_zero)
 
-    def add(self, sample: Sample) -> None:
-        """Take in one sample and write it."""
+    def unzeroed(self, sample: ForceSample) -> float:
+        """Newtons of one sample by certificate alone, its zero not taken off."""
+        return self._gains.force * sample.reading
+
+    def add(self, sample: Sample) -> Sample:
+        """Take in one sample, write it, and give it back; a measured voltage comes back by its certificate."""
+        if isinstance(sample, HVSample):
+            sample = replace(sample, voltage=sample.voltage * self._gains.voltage)
         match sample:
             case ForceSample():
                 self.force_sample = sample
@@ -106,11 +113,12 @@ class Recorder:
                 self._write(
                     "/hv/sample",
                     sample.t,
-                    voltage_V=sample.voltage * self._gains.voltage,
+                    voltage_V=sample.voltage,
                     current_A=sample.current,
                     setpoint_V=sample.setpoint,
                     flags=sample.flags.value,
                 )
+        return sample
 
     def wire(self, role: str, way: Literal["rx", "tx"], data: bytes) -> None:
         """Write bytes as they were on the wire."""
@@ -143,7 +151,8 @@ class Recorder:
             self._log.metadata("units", {"/force/sample reading": force})
         except LogError:
             self.log_failed = True
-            raise
+            if not self.best_effort:
+                raise
 
     def phase(self, fields: Mapping[str, object]) -> None:
         """Write the beginning of an action."""
@@ -161,7 +170,8 @@ class Recorder:
             self._log.tick(now)
         except LogError:
             self.log_failed = True
-            raise
+            if not self.best_effort:
+                raise
 
     def _write(self, topic: str, t: float, **fields: object) -> None:
         """The first error of the log ends the run; after it the way to the safe state goes on unrecorded."""
@@ -172,4 +182,5 @@ class Recorder:
             self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), epoch_ns(t))
         except LogError:
             self.log_failed = True
-            raise
+            if not self.best_effort:
+                raise

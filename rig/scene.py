@@ -118,7 +118,7 @@ class ZaberTable(SerialTable):
     baud: int = Field(default=115200, gt=0)
     device: int = Field(default=1, ge=1, le=99)
     axis: int = Field(default=1, ge=1, le=9)
-    poll_rate_Hz: float = Field(default=50.0, gt=0, le=200)
+    poll_rate_Hz: float = Field(default=50.0, ge=5, le=200)
     approach_from_mm: float = Field(default=0.0, ge=0)  # stage position, short of the film, where approaching begins
 
 
@@ -138,7 +138,7 @@ class KeyenceTable(SerialTable):
     driver: Literal["keyence-lkg"]
     baud: int = Field(default=115200, gt=0)
     output: int = Field(default=1, ge=1, le=2)
-    poll_rate_Hz: float = Field(default=50.0, gt=0, le=200)
+    poll_rate_Hz: float = Field(default=50.0, ge=5, le=200)
 
 
 class ShvpsTable(SerialTable):

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # SIGHUP does not exist on Windows
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")  # the last two do not exist on Windows
 
 
 @dataclass

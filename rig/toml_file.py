@@ -123,6 +123,7 @@ _TAGS = {
     "ramp",
     "hold",
     "sweep",
+    "voltage",
     "return",
     "zaber",
     "gsv8",

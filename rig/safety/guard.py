@@ -13,12 +13,12 @@ from collections.abc import Callable
 from enum import Enum, Flag
 
 from drivers.roles import HVFlag, HVSample, HVSupply
-from rig.errors import FaultError, LimitError
+from rig.errors import FaultError
 from rig.safety.limits import FilmLimits, Limits
 
 SAFE_VOLTAGE = 60.0  # V; below this the discharge is harmless (EN 50191 names 60 V DC)
-SAG_V, SAG_PART = 50.0, 0.05  # a settled output this far below its set-point, in SAG_SAMPLES in a row, has sagged
-SAG_SAMPLES = 2  # ... and so many in which a channel that was on says it is off: not every supply flags a trip
+DEVIATION_V, DEVIATION_PART = 50.0, 0.05  # a settled output this far from its set-point has sagged or risen ...
+DEVIATION_SAMPLES = 2  # ... when this many samples in a row say so
 SAFE_SAMPLES = 2  # consecutive measured voltages below SAFE_VOLTAGE before we call the output safe
 
 TRIP = HVFlag.TRIPPED | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.INTERLOCK_OPEN | HVFlag.ARC | HVFlag.FAULT
@@ -57,14 +57,16 @@ class Guard:
         tell: Callable[[str, str], None],
     ) -> None:
         self.state = GuardState.SAFE
-        self.cause = "start"
+        self.cause = "not armed"
+        self.commanded = False  # whether the supply was ever told anything; until then it is left alone
+        self.setpoint = 0.0
         self._supply = supply
         self._limits = limits
         self._film = film
         self._ramp = ramp
         self._tell = tell
         self._low_samples = 0
-        self._sagging_samples = 0
+        self._deviating_samples = 0
         self._seen_on = False
         self.last: HVSample | None = None
 
@@ -72,6 +74,13 @@ class Guard:
     def output_is_safe(self) -> bool:
         """Whether the *measured* voltage has been below 60 V for the last two samples."""
         return self._low_samples >= SAFE_SAMPLES
+
+    @property
+    def ramp_duration(self) -> float:
+        """Seconds that a ramp from the measured voltage to zero should take."""
+        measured = abs(self.last.voltage) if self.last is not None else math.nan
+        start = measured if math.isfinite(measured) else self._limits.voltage.high
+        return start / self._ramp
 
     def arm(self) -> None:
         """Leave SAFE. The supply must be measurably off and free of faults.
@@ -81,28 +90,38 @@ class Guard:
         FaultError
             When the supply is live, tripped or unmeasured; nothing is changed then.
         """
-        if self.last is None or not self.output_is_safe:
-            measured = "not measured yet" if self.last is None else f"{self.last.voltage:.0f} V"
-            raise FaultError(
-                f"hv: cannot be armed, its output is {measured}. Nothing was changed. "
-                "Find out who switched it on; ramp it down by hand; start again."
-            )
-        if HVFlag.ON in self.last.flags:
-            raise FaultError(
-                "hv: cannot be armed, the channel is already on. Nothing was changed. Switch it off first."
-            )
+        self.check_off()
+        assert self.last is not None
         faults = self.last.flags & TRIP
         if faults:
             raise FaultError(f"hv: cannot be armed, the supply reports {flag_names(faults)}. Clear the cause first.")
         limited = self._supply.measures_current
         limit = f"current limit {self._limits.current.high:g} A" if limited else "no current limit"
         self._tell("arm", f"ramp {self._ramp:g} V/s, {limit}")
+        self.commanded = True
         self._supply.set_ramp(self._ramp)
         if limited:
             self._supply.set_current_limit(self._limits.current.high)
         self.state = GuardState.ARMED
         self.cause = ""
         self._seen_on = False
+
+    def check_off(self) -> None:
+        """The output must have been measured off, and the channel say that it is.
+
+        Raises
+        ------
+        FaultError
+            When it is live or unmeasured; nothing is changed then.
+        """
+        if self.last is None or not self.output_is_safe:
+            measured = "not measured yet" if self.last is None else f"{self.last.voltage:.0f} V"
+            raise FaultError(
+                f"hv: cannot be used, its output is {measured} though nobody switched it on from here. Nothing was "
+                "changed. Find out who did; take it down by hand; start again."
+            )
+        if HVFlag.ON in self.last.flags:
+            raise FaultError("hv: cannot be used, the channel is on already. Nothing was changed. Switch it off first.")
 
     def request(self, volts: float, h: float) -> None:
         """Ramp the output to ``volts`` with the disk at displacement ``h`` metres.
@@ -119,6 +138,7 @@ class Guard:
         self._limits.voltage.check(volts, "HV set-point")
         self._film.check(h, volts, f"HV set-point {volts:g} V at {h * 1e3:.2f} mm")
         self._tell("set_voltage", f"{volts:g} V")
+        self.setpoint = volts
         self._supply.set_voltage(volts)
         if self.state is GuardState.ARMED:
             self._tell("switch_on", "")
@@ -145,57 +165,53 @@ class Guard:
         faults = sample.flags & TRIP
         if faults:
             raise FaultError(f"hv: the supply reports {flag_names(faults)}.")
+        self._judge_deviation(sample)
+
+    def _judge_deviation(self, sample: HVSample) -> None:
+        """The output must be on, at the set-point that was asked for; two samples in a row that say no are a fault."""
         on = HVFlag.ON in sample.flags
         self._seen_on = self._seen_on or on
-        settled = on and HVFlag.RAMPING not in sample.flags
-        sagging = settled and not sample.voltage >= sample.setpoint - max(SAG_V, SAG_PART * sample.setpoint)
-        went_off = self._seen_on and not on
-        self._sagging_samples = self._sagging_samples + 1 if sagging or went_off else 0
-        if self._sagging_samples >= SAG_SAMPLES:
-            if went_off:
-                raise FaultError("hv: the supply says that it is off, and nobody switched it off from here.")
-            raise FaultError(
-                f"hv: the output has sagged to {sample.voltage:.0f} V with {sample.setpoint:.0f} V set: "
-                "the film draws more current than the supply gives."
-            )
+        settled = on and HVFlag.RAMPING not in sample.flags and not self._supply.busy
+        allowed = max(DEVIATION_V, DEVIATION_PART * self.setpoint)
+        problem = ""
+        if self._seen_on and not on:
+            problem = "the supply says that it is off, and nobody switched it off from here"
+        elif settled and not math.isclose(sample.setpoint, self.setpoint, rel_tol=1e-3, abs_tol=1.0):
+            problem = f"its set-point is {sample.setpoint:.0f} V, and {self.setpoint:.0f} V were asked for from here"
+        elif settled and not abs(sample.voltage - self.setpoint) <= allowed:
+            word = "sagged" if sample.voltage < self.setpoint else "risen"
+            problem = f"the output has {word} to {sample.voltage:.0f} V with {self.setpoint:.0f} V set"
+        self._deviating_samples = self._deviating_samples + 1 if problem else 0
+        if self._deviating_samples >= DEVIATION_SAMPLES:
+            raise FaultError(f"hv: {problem}.")
 
     def ramp_off(self, cause: str) -> None:
-        """Ramp the output down, switch it off and latch SAFE. For orderly ends; does nothing if never armed."""
+        """Ramp the output down, switch it off and latch SAFE. For orderly ends; does nothing unless armed or live."""
         if self.state is GuardState.SAFE:
             return
         self._latch(cause)
-        self._tell("switch_off", cause)
-        self._supply.switch_off()
+        try:
+            self._tell("switch_off", cause)
+        finally:
+            self._supply.switch_off()
 
     def kill(self, cause: str) -> None:
         """Take the output off at once and latch SAFE. A supply that was never armed is left alone."""
-        if self.state is GuardState.SAFE and self.cause == "start":
+        if not self.commanded:
             return
         self._latch(cause)
-        self._tell("emergency_off", cause)
-        self._supply.emergency_off()
+        try:
+            self._tell("emergency_off", cause)
+        finally:
+            self._supply.emergency_off()
 
     def _latch(self, cause: str) -> None:
         self.state = GuardState.SAFE
         self.cause = cause
+        self.setpoint = 0.0
         self._low_samples = 0
 
 
 def flag_names(flags: Flag) -> str:
     """The flags in plain words."""
     return ", ".join((flag.name or "").lower().replace("_", " ") for flag in flags)
-
-
-def check_path(film: FilmLimits, h0: float, h1: float, voltage: float, points: int = 5) -> None:
-    """Check the film along a move from ``h0`` to ``h1`` metres at ``voltage`` volts, ends included.
-
-    Raises
-    ------
-    LimitError
-        At the first displacement where field or tension does not hold.
-    """
-    if not (math.isfinite(h0) and math.isfinite(h1)):
-        raise LimitError("A move was asked for from or to a displacement that is not a number.")
-    for k in range(points):
-        h = h0 + (h1 - h0) * k / (points - 1)
-        film.check(h, voltage, f"Move to {h1 * 1e3:.2f} mm with {voltage:g} V on, at {h * 1e3:.2f} mm")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from model.membrane import Status, solve
 from model.specimen import Specimen
@@ -39,6 +39,10 @@ class Limit:
         """
         if not self.holds(value):
             raise LimitError(f"{where}: {self.name} {self._text(value)} is outside {self.allowed}.")
+
+    def widened(self, factor: float) -> Limit:
+        """The same limit with both ends multiplied by ``factor``."""
+        return replace(self, low=self.low * factor, high=self.high * factor)
 
     @property
     def allowed(self) -> str:
@@ -116,3 +120,17 @@ class FilmLimits:
         self._limits.hoop_stress.check(state.min_hoop_stress, where)
         if state.status is not Status.TAUT:
             raise LimitError(f"{where}: the model has no taut state there ({state.status.message}).")
+
+    def check_path(self, h0: float, h1: float, voltage: float, points: int = 5) -> None:
+        """Check the film along a move from ``h0`` to ``h1`` metres at ``voltage`` volts, ends included.
+
+        Raises
+        ------
+        LimitError
+            At the first displacement where field or tension does not hold.
+        """
+        if not (math.isfinite(h0) and math.isfinite(h1)):
+            raise LimitError("A move was asked for from or to a displacement that is not a number.")
+        for k in range(points):
+            h = h0 + (h1 - h0) * k / (points - 1)
+            self.check(h, voltage, f"Move to {h1 * 1e3:.2f} mm with {voltage:g} V on, at {h * 1e3:.2f} mm")

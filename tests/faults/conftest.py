@@ -73,6 +73,17 @@ class Story:
         return self.end - self.mischief_at
 
     @property
+    def off_after(self) -> float:
+        """Seconds from the mischief until the log has the output measured below 60 V."""
+        hv = read_log(self.log).columns("/hv/sample")
+        return float(hv["t_s"][(hv["t_s"] > self.mischief_at) & (hv["voltage_V"] < 60)][0]) - self.mischief_at
+
+    @property
+    def stage_words(self) -> list[str]:
+        """What was commanded of the stage, in order, from the log."""
+        return [m.fields["command"] for m in read_log(self.log).messages("/command") if m.fields["device"] == "stage"]
+
+    @property
     def control_words(self) -> list[str]:
         """What was commanded of the supply, in order, from the log."""
         return [m.fields["command"] for m in read_log(self.log).messages("/command") if m.fields["device"] == "hv"]
@@ -120,11 +131,12 @@ def tell(tmp_path: Path) -> Tell:
 
         path = tmp_path / "run.mcap"
         with LogWriter(path) as log:
-            engine = Engine(bench, actions, log, gains, stop, progress)
+            engine = Engine(bench, actions, log, gains, stop, progress, {"force": certificate})
             outcome, error = engine.run()
             bench.close()
             if not engine.recorder.log_failed:
                 log.finish(outcome.as_text())
+        assert mischief is None or done_at, "the mischief never happened"
         now = clock.now()
         final = float(simulated.world.voltage(np.array([now]))[0])
         return Story(outcome, error, simulated, path, done_at[0] if done_at else now, now, outputs, final)

@@ -113,7 +113,7 @@ def test_damaged_answers_never_raise_the_voltage(tell_other: Tell, seed: int) ->
 
 def test_a_supply_found_live_is_reported_and_left_alone(tell_other: Tell) -> None:
     story = tell_other(replace=("[simulation.hv]", "[simulation.hv]\nstart_live_V = 500.0"))
-    assert isinstance(story.error, FaultError) and "cannot be armed" in story.outcome.reason
+    assert isinstance(story.error, FaultError) and "though nobody switched it on" in story.outcome.reason
     assert story.final_output == pytest.approx(500, abs=5) and not story.outcome.safe
     assert not {"set_voltage", "switch_off", "emergency_off"} & set(story.control_words)
 
@@ -126,5 +126,6 @@ def test_an_error_during_the_ramp_down_does_not_keep_the_emergency_off_from_bein
 
     story = tell(mischief, scene=scene)
     assert story.outcome.status == "stopped" and not story.outcome.safe
-    assert story.control_words[-2:] == ["switch_off", "emergency_off"]
+    words = story.control_words
+    assert set(words[words.index("switch_off") + 1 :]) == {"emergency_off"}
     assert abs(story.final_output) < 60

@@ -70,7 +70,8 @@ def test_a_device_lost_or_silent_ends_the_run(tell: Tell, role: str, kind: str) 
     assert isinstance(story.error, (DeviceError, FaultError)), story.error
     assert story.outcome.status == "fault" and role in story.outcome.reason
     if role != "hv":
-        assert abs(story.final_output) < 60 and story.outcome.safe and story.took < 1.0 + AT_ONCE_S
+        assert abs(story.final_output) < 60 and story.outcome.safe and story.off_after < 1.0 + AT_ONCE_S
+        assert story.outcome.standing is (role != "stage")
     elif kind == "silent":  # commands still reach it, but nothing proves that
         assert abs(story.final_output) < 60 and not story.outcome.safe
     else:
@@ -95,10 +96,88 @@ def test_a_breakdown_takes_the_output_off_at_once(tell: Tell) -> None:
 def test_a_supply_found_live_is_reported_and_left_alone(tell: Tell) -> None:
     story = tell(replace=("[simulation.hv]", "[simulation.hv]\nstart_live_V = 500.0"))
     assert isinstance(story.error, FaultError)
-    assert "cannot be armed" in story.outcome.reason
+    assert "though nobody switched it on from here" in story.outcome.reason
+    assert "move_to" not in story.stage_words and "home" not in story.stage_words
     assert story.final_output == pytest.approx(500, abs=5)
     assert "set_voltage" not in story.control_words and "switch_off" not in story.control_words
     assert not story.outcome.safe
+
+
+def test_a_supply_that_does_not_hear_the_first_off_is_told_again(tell: Tell) -> None:
+    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+        bench.inject(Fault(role="hv", kind="silent", duration_s=1.0, direction="both"))
+        stop.ask("a test")
+
+    story = tell(mischief)
+    assert abs(story.final_output) < 60 and story.outcome.safe, story.outcome
+    assert "emergency_off" in story.control_words
+
+
+@pytest.mark.parametrize("duration_s", [0.2, 1.0])
+def test_a_supply_that_vanishes_and_comes_back_is_switched_off(tell: Tell, duration_s: float) -> None:
+    story = tell(inject("hv", "vanish", duration_s=duration_s))
+    assert isinstance(story.error, DeviceLost)
+    assert abs(story.final_output) < 60 and story.outcome.safe, story.outcome
+
+
+@pytest.mark.parametrize("driver", ["zaber.ZaberStage", "gsv8.GSV8", "keyence_lkg.KeyenceLKG"])
+def test_a_driver_with_a_mistake_of_ours_does_not_keep_the_voltage_on(
+    tell: Tell, monkeypatch: pytest.MonkeyPatch, driver: str
+) -> None:
+    def broken(self: object, now: float) -> None:
+        raise TypeError("a mistake")
+
+    story = tell(lambda bench, stop: monkeypatch.setattr(f"drivers.{driver}.poll", broken))
+    assert isinstance(story.error, TypeError) and story.outcome.status == "fault"
+    assert abs(story.final_output) < 60 and story.outcome.safe and story.off_after < AT_ONCE_S
+    assert "internal error" in read_log(story.log).outcome["reason"]  # type: ignore[index]
+
+
+def test_a_slow_ramp_down_is_left_its_time(tell: Tell) -> None:
+    story = tell(lambda bench, stop: stop.ask("a test"), replace=("ramp_V_per_s = 300.0", "ramp_V_per_s = 60.0"))
+    assert abs(story.final_output) < 60 and story.outcome.safe
+    assert story.took > 10 and "emergency_off" not in story.control_words
+
+
+def test_progress_that_cannot_be_shown_does_not_end_the_run(tell: Tell) -> None:
+    def gone(bench: SimulatedBench, stop: StopRequest) -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    story = tell(gone)
+    assert story.outcome.status == "complete" and story.outcome.safe
+
+
+def test_a_sensor_far_off_at_zero_is_refused(tell: Tell) -> None:
+    story = tell(replace=("full_scale_N = 1.0", "full_scale_N = 1.0\nzero_offset_mV_per_V = 1.0"))
+    assert isinstance(story.error, LimitError) and "Zero of the force sensor" in story.outcome.reason
+    assert "set_voltage" not in story.control_words
+
+
+def test_a_film_met_before_the_approach_begins_is_a_fault(tell: Tell) -> None:
+    story = tell(replace=("contact_position_mm = 40.0", "contact_position_mm = 33.0"))
+    assert isinstance(story.error, FaultError) and "met something before 36 mm" in story.outcome.reason
+
+
+def test_a_certificate_of_another_sensor_is_told_in_the_log(tell: Tell) -> None:
+    story = tell(replace=("full_scale_N = 1.0", "full_scale_N = 1.0\nserial_number = 4711"))
+    events = [message.fields["message"] for message in read_log(story.log).messages("/event")]
+    assert any("serial number" in text and "4711" in text for text in events)
+
+
+def test_a_log_that_fails_on_the_way_to_the_safe_state_stops_nothing(
+    tell: Tell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+        def full(self: LogWriter, *arguments: object) -> None:
+            raise LogError(self.path, "writing failed (No space left on device)")
+
+        monkeypatch.setattr(LogWriter, "write", full)
+        monkeypatch.setattr(LogWriter, "tick", full)
+        stop.ask("a test")
+
+    story = tell(mischief)
+    assert isinstance(story.error, Stopped)
+    assert abs(story.final_output) < 60 and story.outcome.safe and story.outcome.standing
 
 
 def test_a_log_that_cannot_be_written_ends_the_run(tell: Tell, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.roles import HVFlag, HVSample
 from rig.errors import FaultError, LimitError
-from rig.safety.guard import Guard, GuardState, check_path
+from rig.safety.guard import Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.scene import load_scene
 
@@ -22,6 +22,7 @@ class Supply:
     """Writes down what it is told."""
 
     measures_current = True
+    busy = False
 
     def __init__(self) -> None:
         self.told: list[tuple[str, float | None]] = []
@@ -58,8 +59,8 @@ def make() -> tuple[Guard, Supply, list[str]]:
     return guard, supply, log
 
 
-def sample(voltage: float, flags: HVFlag = OFF, current: float = 0.0) -> HVSample:
-    return HVSample(0.0, voltage, current, 0.0, flags)
+def sample(voltage: float, flags: HVFlag = OFF, current: float = 0.0, setpoint: float = 1000.0) -> HVSample:
+    return HVSample(0.0, voltage, current, setpoint, flags)
 
 
 def live() -> tuple[Guard, Supply, list[str]]:
@@ -88,7 +89,7 @@ def test_watching_changes_nothing() -> None:
         ([sample(0.0)], "0 V"),
         ([sample(0.0), sample(math.nan)], "nan"),
         ([sample(0.0), sample(1500.0)], "1500 V"),
-        ([sample(0.0, HVFlag.ON)] * 2, "already on"),
+        ([sample(0.0, HVFlag.ON)] * 2, "on already"),
         ([sample(0.0, HVFlag.INTERLOCK_OPEN)] * 2, "interlock open"),
     ],
 )
@@ -133,11 +134,11 @@ def test_a_voltage_that_the_flat_film_bears_is_refused_on_the_stretched_one() ->
 def test_a_path_is_checked_along_its_way() -> None:
     limits = Limits.of(SCENE)
     film = FilmLimits(SCENE.specimen.specimen(), limits)
-    check_path(film, 0.0, 0.011, 1500.0)
+    film.check_path(0.0, 0.011, 1500.0)
     with pytest.raises(LimitError, match="field"):
-        check_path(film, 0.0, 0.0125, 1500.0)
+        film.check_path(0.0, 0.0125, 1500.0)
     with pytest.raises(LimitError, match="not a number"):
-        check_path(film, 0.0, math.nan, 0.0)
+        film.check_path(0.0, math.nan, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -183,6 +184,34 @@ def test_a_channel_that_goes_off_by_itself_is_a_fault() -> None:
     guard.on_sample(sample(600.0))
     with pytest.raises(FaultError, match="says that it is off"):
         guard.on_sample(sample(100.0))
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (sample(900.0, HVFlag.ON), "sagged"),
+        (sample(1100.0, HVFlag.ON), "risen"),
+        (sample(1000.0, HVFlag.ON, setpoint=1200.0), "were asked for from here"),
+    ],
+)
+def test_an_output_that_is_not_where_it_was_sent_is_a_fault_at_the_second_sample(bad: HVSample, words: str) -> None:
+    guard, _, _ = live()
+    guard.on_sample(sample(1000.0, HVFlag.ON))
+    guard.on_sample(bad)
+    guard.on_sample(sample(1000.0, HVFlag.ON))
+    guard.on_sample(sample(700.0, HVFlag.ON | HVFlag.RAMPING))  # on its way somewhere
+    guard.on_sample(bad)
+    with pytest.raises(FaultError, match=words):
+        guard.on_sample(bad)
+
+
+def test_off_counts_anew_after_every_command() -> None:
+    guard, _, _ = live()
+    assert not guard.output_is_safe  # though it was measured off twice before it was armed
+    guard.on_sample(sample(10.0))
+    guard.on_sample(sample(10.0))
+    guard.kill("test")
+    assert not guard.output_is_safe
 
 
 def test_off_is_believed_only_when_measured_twice() -> None:

@@ -1,0 +1,127 @@
+"""The way to the safe state, whatever ended the run: voltage off and measured off, stage standing.
+
+Nothing may skip it. A device that fails on the way is reported and tried again; it does not keep the others from being
+made safe. The log is written as far as it can be, and its failure is no reason to stop either.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from drivers.roles import HVSample
+from rig.bench import Bench
+from rig.recorder import Recorder
+from rig.safety.guard import SAFE_VOLTAGE, Guard
+from rig.signals import StopRequest
+
+AT_ONCE_S = 5.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
+RAMP_PATIENCE, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
+AGAIN_S = 0.1  # a command that failed is given again at this interval
+LISTEN_S = 2.0  # for a supply that was never commanded: how long to wait for measurements of it
+
+ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What was measured at the end.
+
+    ``safe``: the output was measured below 60 V twice, or the scene has no HV. ``standing``: the stage said that it
+    stands still.
+    """
+
+    safe: bool
+    standing: bool
+
+
+class Teardown:
+    """Makes one bench safe. ``guard`` is None when the scene has no HV, or its supply was never reached."""
+
+    def __init__(self, bench: Bench, guard: Guard | None, recorder: Recorder, stop: StopRequest) -> None:
+        self._bench = bench
+        self._guard = guard
+        self._recorder = recorder
+        self._stop = stop
+        self._told: set[str] = set()
+        self._failed: set[str] = set()  # roles that did not answer when last asked
+        self._again = dict.fromkeys(bench.devices, -math.inf)
+
+    def run(self, cause: str, orderly: bool, next_turn: Callable[[float], float]) -> Rest:
+        """Stop the stage, take the voltage off, and wait until both have been measured.
+
+        An orderly end ramps down; otherwise the output is taken off at once. A second signal, a supply that fails,
+        or a ramp that takes too long turn the ramp into an emergency off.
+        """
+        clock, guard = self._bench.clock, self._guard
+        self._recorder.best_effort = True
+        commanded = guard is not None and guard.commanded
+        hastened = not orderly
+        end = clock.now() + (AT_ONCE_S if hastened else self._ramp_limit()) if commanded else clock.now() + LISTEN_S
+        self._off(cause, at_once=hastened)
+        self._stop_stage()
+        while self._bench.devices:
+            now = clock.now()
+            if commanded and not hastened and (self._stop.count >= 2 or "hv" in self._failed or now >= end):
+                hastened, end = True, now + AT_ONCE_S
+                self._off(f"{cause}; hastened", at_once=True)
+            for role in sorted(self._bench.devices, key=lambda role: role != "hv"):
+                if not self._attempt(role, partial(self._poll, role)) and now >= self._again[role]:
+                    self._again[role] = now + AGAIN_S
+                    if role == "hv" and hastened:
+                        self._off(f"{cause}; again", at_once=True)
+                    elif role == "stage":
+                        self._stop_stage()
+            if (self._safe() and self._standing()) or (now >= end and (hastened or not commanded)):
+                break
+            self._recorder.tick(now)
+            clock.sleep_until(next_turn(now))
+        rest = Rest(self._safe(), self._standing())
+        if not rest.safe:
+            message = f"NOT SAFE: the output was not measured below {SAFE_VOLTAGE:.0f} V. {ADVICE}"
+            self._recorder.event("error", "hv", message)
+        return rest
+
+    def _ramp_limit(self) -> float:
+        assert self._guard is not None
+        return self._guard.ramp_duration * RAMP_PATIENCE + RAMP_GRACE_S
+
+    def _off(self, cause: str, *, at_once: bool) -> None:
+        guard = self._guard
+        if guard is not None:
+            self._attempt("hv", lambda: guard.kill(cause) if at_once else guard.ramp_off(cause))
+
+    def _stop_stage(self) -> None:
+        if "stage" in self._bench.devices:
+            self._recorder.command("stage", "stop", "")
+            self._attempt("stage", self._bench.stage.stop)
+
+    def _poll(self, role: str) -> None:
+        for sample in self._bench.devices[role].poll(self._bench.clock.now()):
+            added = self._recorder.add(sample)
+            if isinstance(added, HVSample) and self._guard is not None:
+                self._guard.on_sample(added)
+
+    def _attempt(self, role: str, act: Callable[[], None]) -> bool:
+        """Whether ``act`` succeeded. Any error at all is only reported: here nothing must stand in the way."""
+        try:
+            act()
+        except Exception as error:
+            self._failed.add(role)
+            text = str(error) or repr(error)
+            if text not in self._told:
+                self._told.add(text)
+                self._recorder.event("error", role, text)
+            return False
+        self._failed.discard(role)
+        return True
+
+    def _safe(self) -> bool:
+        if self._guard is None:
+            return self._bench.scene.hv is None
+        return self._guard.output_is_safe and "hv" not in self._failed
+
+    def _standing(self) -> bool:
+        return "stage" in self._bench.devices and "stage" not in self._failed and not self._bench.stage.moving
