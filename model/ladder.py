@@ -77,7 +77,7 @@ def advance(state: State, step: ritz.Step, at: ritz.Points, grid: Grid) -> tuple
     w = state.w
     change = np.abs(step.dw / w).max(axis=(0, 1))
     if at.law.maxwell is not None:
-        change *= np.sqrt(1.0 + np.abs(at.law.maxwell / at.law.t1).max(axis=(0, 1)))
+        change *= np.sqrt(np.maximum(1.0, np.abs(at.law.maxwell / at.law.t1).max(axis=(0, 1))))
     short: Array | float = 1.0
     if not change.max() <= 0.8:
         short = np.where(change > 2.0, 2.0 / change, 1.0)
@@ -184,7 +184,7 @@ def refine(start: Start, problem: Problem, modes: int) -> Start:
     carry = ritz.transfer(old.modes, modes)
 
     def moved(values: Array) -> Array:
-        return (carry @ values.reshape(old.points, -1)).reshape(modes + 4, m, states)
+        return (carry @ values.reshape(old.points, -1)).reshape(-1, m, states)
 
     natural, relaxed = start.state.natural, start.state.relaxed
     w = moved(start.state.w)
@@ -195,7 +195,7 @@ def refine(start: Start, problem: Problem, modes: int) -> Start:
             c,
             w,
             None if natural is None else moved(natural),
-            None if relaxed is None else np.broadcast_to(relaxed[:1], (modes + 4, m, states)),
+            None if relaxed is None else np.broadcast_to(relaxed[:1], w.shape),
         ),
     )
 

@@ -24,6 +24,7 @@ BLOCK = 1024  # states solved together: their arrays stay in the processor's cac
 # followed from rest.
 SOFTENING = 0.35
 TRACE_MODES = 10
+WIDEST = 28.0  # ln(b/a) beyond which the film's R^2 has no place in double precision
 FLAT = -1e-13  # of G: a hoop stress that is zero in the exact solution may come out as round-off
 
 
@@ -435,6 +436,9 @@ class _Block:
     def solve(self, result: _Flat, tolerance: float, wrinkling: Wrinkling, sensitivities: bool) -> None:
         """Solve the block and write what comes out."""
         index, problem = np.arange(len(self.index)), self.problem
+        if problem.span.max() > WIDEST:
+            result.status[self.index] = Status.NOT_CONVERGED
+            return
         if problem.film.field is not None:
             slack = self.slack()
             if slack.any():

@@ -68,10 +68,13 @@ def barycentric(xi: Array, at: Array) -> Array:
     return out
 
 
+MORE_POINTS = 3  # Gauss points than modes: with fewer the quadrature's error outgrows the modes', more change nothing
+
+
 @lru_cache(maxsize=64)
 def table(modes: int) -> Table:
-    """Tables for ``modes`` integrated Legendre modes, made once; four Gauss points more than modes."""
-    points = modes + 4
+    """Tables for ``modes`` integrated Legendre modes, made once."""
+    points = modes + MORE_POINTS
     xi, weight = np.polynomial.legendre.leggauss(points)
     k = np.arange(1, modes + 1).astype(np.float64)
     legendre = np.polynomial.legendre.legvander(xi, points)

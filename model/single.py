@@ -143,10 +143,9 @@ class _Solver:
         give = miss = rest = 0.0
         kept = []
         stable = True
-        for i in range(points):
+        for i, (slope, once, radius) in enumerate(zip(w, self.once, self.radius, strict=True)):
             e = strain[i]
             q = e + strain[points + i] * dxi
-            slope = w[i]
             g = q * (q + 2.0) + slope * slope
             metric = 1.0 + g
             log1 = 0.5 * log1p(g) + lnlp
@@ -182,7 +181,6 @@ class _Solver:
             h12a = h12 * around
             kew = h12a * down
             gw = t1 * down
-            once, radius = self.once[i], self.radius[i]
             twice = once * radius
             thw = tm * hw
             qq = twice * (d / metric + tm) * thw
@@ -216,7 +214,7 @@ class _Solver:
             if not change <= largest:
                 largest = change
             new.append(w[i] + dw)
-        largest *= math.sqrt(1.0 + rest)
+        largest *= math.sqrt(max(1.0, rest))
         moved = [x + dx for x, dx in zip(c, dc, strict=True)]
         tail = moved[-1] ** 2 * diagonal[-1] + 0.1 * moved[-2] ** 2 * diagonal[-2]
         return moved, new, lam, largest, stable and positive, 0.5 * tail / (lam * film.height)
@@ -285,7 +283,10 @@ class _Solver:
         for _ in range(3):
             t1, _, h11, _, _, _ = _stress(self.film, log1, lnlp)
             factor = exp(lnlp - log1)
-            log1 += (pull - t1 * factor) / ((h11 - t1) * factor)
+            step = (pull - t1 * factor) / ((h11 - t1) * factor)
+            log1 += step
+            if abs(step) < 1e-7:  # the next one would be its square
+                break
         if not abs(log1 - start) < 0.1 + 0.5 * abs(start - lnlp):
             return None
         t1, t2, _, _, _, _ = _stress(self.film, log1, lnlp)

@@ -53,7 +53,8 @@ def test_independent_formulation(lp: float, h: float, voltage: np.ndarray) -> No
         assert np.all(error <= tolerance)
         assert np.all(error <= 3.0 * found.error_estimate)
     np.testing.assert_allclose(found.peak_field, truth.peak_field, rtol=1e-5)
-    np.testing.assert_allclose(found.min_meridional_stress, truth.min_meridional_stress, rtol=1e-5)
+    # Inside the film stresses err with the square root of the force's error.
+    np.testing.assert_allclose(found.min_meridional_stress, truth.min_meridional_stress, rtol=3e-5)
 
 
 def test_a_taut_film_pays_for_no_relaxed_energy() -> None:
