@@ -201,7 +201,8 @@ def settle(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
                 breaks[cut] += shift
                 change = np.maximum(change, CUT_WEIGHT * np.abs(shift) / np.minimum(length[cut - 1], length[cut]))
             breaks[1:-1] = np.clip(breaks[1:-1], breaks[:-2], breaks[2:])
-            grid = Grid.lay(t.modes, breaks)
+            # Where it has settled the state belongs to the cuts as they were.
+            grid = Grid.lay(t.modes, np.where(change <= goal, grid.breaks, breaks))
         state = new
         done = change <= goal
         stable = step.stable & at.law.relief.regular.all(axis=(0, 1))
