@@ -28,7 +28,7 @@ from calibration.problem import TOLERANCE, IdentificationError, Problem
 from calibration.profile import intervals, targets, widened
 from calibration.propagation import secant_modulus, state
 from calibration.reduction import interpolation_matrix, select
-from calibration.result import CurveResult, Identification
+from calibration.result import IDENTIFIED, CurveResult, Identification, verdict
 from model.materials import Material
 from model.membrane import solve_many
 
@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 __all__ = ["IdentificationError", "compare", "identify", "secant_modulus"]
 
 PASSES = 5
+WRONG_MODEL = 9.0  # lack of fit per degree of freedom from which on the model does not describe the data at all
 SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
 SHARE_BOUNDS = (1e-6, 100.0)
 EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
@@ -348,6 +349,17 @@ def _assemble(
         advice=[] if held else advice(problem.curves, problem.film(x), stated.quantities),
         provenance=provenance,
     )
+    if misfit > WRONG_MODEL:
+        doubted = {
+            name: replace(quantity, verdict=verdict(max(quantity.relative, 1.01 * IDENTIFIED), quantity.at_bound))
+            for name, quantity in quantities.items()
+        }
+        notes = [
+            "the model misses the data by far more than their noise, so nothing counts as identified; are all logs of "
+            "one film? Fit each alone and compare",
+            *notes,
+        ]
+        result = replace(result, quantities=doubted)
     return replace(result, warnings=[*_warnings(result, problem, fit), *notes])
 
 

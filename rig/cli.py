@@ -22,8 +22,14 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
-        except (click.ClickException, click.exceptions.Exit, click.Abort):
+        except (click.ClickException, click.exceptions.Exit):
             raise
+        except click.Abort:
+            click.echo("\nNot confirmed. Nothing was moved, no voltage was given, no log was written.", err=True)
+            ctx.exit(2)
+        except KeyboardInterrupt:  # a run takes Ctrl-C itself; this is before it, after it, or another command
+            click.echo("\nStopped by Ctrl-C. Nothing was being driven.", err=True)
+            ctx.exit(130)
         except BrokenPipeError:
             ctx.exit(1)
         except Exception as error:
@@ -43,7 +49,9 @@ def _exit_code(error: Exception) -> int | None:
 
     if isinstance(error, RigError):
         return error.exit_code
-    return 4 if isinstance(error, DeviceError) else None
+    if isinstance(error, DeviceError):
+        return 4
+    return 1 if isinstance(error, OSError) else None  # the disk or terminal that was to be written to
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -94,8 +102,10 @@ def run(scene: Path, protocol: Path, out: Path, ports: Path | None, arm: bool, y
     from rig.errors import ConfigError
     from rig.experiment import prepare
     from rig.experiment import run as run_experiment
+    from rig.outputs import check_new
     from rig.progress import progress
 
+    check_new(out)
     experiment = prepare(scene, protocol, _read_ports(ports) if ports is not None else None)
     if experiment.scene.on_real_ports and experiment.scene.hv is not None:
         highest = max(max(action.voltage) for action in experiment.actions)
@@ -140,11 +150,13 @@ def sim(scene: Path) -> None:
 def fit(logs: tuple[Path, ...], out: Path | None, report: Path | None, terms: int, profiles: bool) -> None:
     """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties."""
     from rig.identification import identify_logs, write_results
+    from rig.outputs import check_new
     from rig.tables import identification_table, show
 
+    check_new(out, report)
     found = identify_logs(list(logs), terms=terms, profiles=profiles)
     write_results(found, out, report)
-    show(identification_table(found.identification))
+    show(identification_table(found.identification), *(f"note: {note}" for note in found.notes))
     for path in (out, report):
         if path is not None:
             click.echo(f"written: {path}")
@@ -163,8 +175,10 @@ def fit_tests(tests: tuple[Path, ...], out: Path | None, terms: int, predict: tu
     file's name, says which test it is.
     """
     from rig.identification import identify_tests, write_text
+    from rig.outputs import check_new
     from rig.tables import show, tests_table
 
+    check_new(out)
     found = identify_tests(tests, predict, terms)
     if out is not None:
         write_text(out, found.to_json())
@@ -179,8 +193,10 @@ def fit_tests(tests: tuple[Path, ...], out: Path | None, terms: int, predict: tu
 @click.option("--screenshot", type=FILE, help="Write a picture instead of opening the viewer; needs no display.")
 def view(log: Path, save: Path | None, screenshot: Path | None) -> None:
     """Open LOG in the Rerun viewer, on this machine only."""
+    from rig.outputs import check_new
     from rig.view import view as view_log
 
+    check_new(save, screenshot)
     view_log(log, save=save, screenshot=screenshot)
     for path in (save, screenshot):
         if path is not None:
@@ -272,6 +288,8 @@ def devices(ports: tuple[str, ...], buses: tuple[str, ...]) -> None:
         asked.append(Bus(interface, channel))
     found = discover(RealClock(), list(ports) or None, asked)
     show(*devices_table(found))
+    if (ports or buses) and not all(one.role for one in found):
+        click.get_current_context().exit(1)
 
 
 @main.command()

@@ -59,7 +59,9 @@ class Outcome:
         if math.isnan(self.voltage):
             output = "no high voltage in this scene" if self.safe else "high voltage NOT SAFE: never measured"
         else:
-            output = f"high voltage {'off' if self.safe else 'NOT SAFE'}, measured {self.voltage:.0f} V"
+            output = (
+                f"high voltage {'off, measured' if self.safe else 'NOT SAFE, last measured'} {round(self.voltage)} V"
+            )
         return f"{stage}; {output}"
 
     def as_text(self) -> dict[str, str]:
@@ -124,6 +126,7 @@ class Engine:
         self._watch: Watch | None = None
         self._started = self.clock.now()
         self._next_progress = 0.0
+        self._doing = ""
 
     # What actions may do -------------------------------------------------------------------------------------
 
@@ -182,6 +185,8 @@ class Engine:
         if error is not None:
             known = isinstance(error, RigError | DeviceError)
             reason = str(error) if known else f"internal error: {error!r}"
+            if self._doing:
+                error.add_note(f"It happened during {self._doing}.")
         rest = Teardown(self.bench, self._guard, self.recorder, self._stop).run(
             reason, status in ("complete", "stopped"), self._next_turn
         )
@@ -267,7 +272,7 @@ class Engine:
                     "record": action.record,
                 }
             )
-            label = f"step {action.step} {action.kind}: {action.label}"
+            label = self._doing = f"step {action.step} {action.kind}: {action.label}"
             with closing(carry_out(self, action)) as turns:
                 for _ in turns:
                     if self.clock.now() >= self._next_progress:

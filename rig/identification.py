@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from calibration.certificate import Certificate, CertificateError, parse_certificate
 from calibration.curve import Curve, CurveError
@@ -18,6 +21,9 @@ from rig.experiment import IN_MEMORY
 from rig.log.dataset import CurveErrors, Run, load_run
 from rig.scene import Scene
 from rig.toml_file import parse_table
+
+# A sample belongs to its curve while the measured voltage is this near to the nominal one.
+VOLTAGE_V, VOLTAGE_PART = 50.0, 0.05
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,7 @@ class Found:
     runs: list[Run]
     provenance: dict[str, object]
     truth: Material | None
+    notes: list[str]
 
 
 def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = False) -> Found:
@@ -46,20 +53,45 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
     """
     runs = [load_run(path) for path in paths]
     scenes = [parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)") for run in runs]
+    hashes = {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
     provenance: dict[str, object] = {
-        "logs": {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths},
+        "logs": hashes,
         "outcomes": {str(run.log.path): (run.log.outcome or {}).get("status", "cut off") for run in runs},
     }
+    if len(set(hashes.values())) < len(paths):
+        raise DataError("The same log is given twice; it would count as if it had been measured twice.")
     curves: list[Curve] = []
     try:
         for run, scene in zip(runs, scenes, strict=True):
-            curves += run.curves(scene.specimen.specimen(), **_errors(run, scene))
+            certificates = _certificates(run)
+            found = run.curves(scene.specimen.specimen(), **_errors(run, scene, certificates))
+            curves += [_with_drift(_at_its_voltage(curve), certificates) for curve in found]
         if not curves:
             raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
         identification = identify(curves, terms=terms, profiles=profiles, provenance=provenance)
     except (CurveError, IdentificationError, CertificateError) as error:
         raise DataError(f"{error}.") from None
-    return Found(identification, curves, runs, provenance, _truth(runs, scenes))
+    return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs))
+
+
+def _at_its_voltage(curve: Curve) -> Curve:
+    """The curve with those samples flagged at which the measured voltage was not the nominal one."""
+    allowed = max(VOLTAGE_V, VOLTAGE_PART * abs(curve.nominal_voltage))
+    elsewhere = ~(np.abs(curve.voltage - curve.nominal_voltage) <= allowed) & np.isfinite(curve.voltage)
+    return replace(curve, flagged=elsewhere if curve.flagged is None else curve.flagged | elsewhere)
+
+
+def _notes(runs: Sequence[Run]) -> list[str]:
+    """What a reader of the result must know of the logs."""
+    notes = []
+    for run in runs:
+        log = run.log
+        if not log.whole:
+            notes.append(f"{log.path} is cut short or damaged; `dea-rig info {log.path}` tells what is missing")
+        status = (log.outcome or {}).get("status", "unknown")
+        if status != "complete":
+            notes.append(f"{log.path} is of a run that did not come to its end: {status}")
+    return notes
 
 
 def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
@@ -80,7 +112,7 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
                 report,
                 found.identification,
                 found.curves,
-                scene_texts={run.log.path.name: run.scene for run in found.runs},
+                scene_texts={str(run.log.path): run.scene for run in found.runs},
                 provenance=found.provenance,
                 truth=found.truth,
             )
@@ -96,7 +128,7 @@ def write_text(path: Path, text: str) -> None:
     ConfigError
         When it cannot be written.
     """
-    part = path.with_name(path.name + ".part")
+    part = path.with_name(f".{path.name}.part")
     try:
         part.write_text(text, encoding="utf-8")
         part.replace(path)
@@ -120,9 +152,18 @@ def identify_tests(tests: Sequence[Path], predict: Sequence[Path], terms: int) -
         raise DataError(f"{error}.") from None
 
 
-def _errors(run: Run, scene: Scene) -> CurveErrors:
+def _with_drift(curve: Curve, certificates: Mapping[str, Certificate]) -> Curve:
+    """The curve with what its sensors' zeros may drift during a run, besides the error with which they were taken."""
+    drift = {role: certificate.zero_uncertainty for role, certificate in certificates.items()}
+    return replace(
+        curve,
+        force_zero=math.hypot(curve.force_zero, drift.get("force", 0.0)),
+        displacement_zero=math.hypot(curve.displacement_zero, drift.get("displacement", 0.0)),
+    )
+
+
+def _errors(run: Run, scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErrors:
     """Noise and uncertainties of a run's curves, from the certificates in its log and from the scene."""
-    certificates = _certificates(run)
     force = certificates.get("force")
     if force is None:
         raise DataError(f"{run.log.path}: the log holds no certificate of the force sensor; its noise is not known.")

@@ -216,17 +216,24 @@ def check_plan(actions: list[Action], scene: Scene) -> list[Prediction]:
     limits = Limits.of(scene)
     specimen = scene.specimen.specimen()
     predictions = []
+    known: dict[object, Prediction] = {}  # a cycle is predicted once
     for action in actions:
         where = f"Step {action.step} ({action.kind}, {action.label})"
         limits.displacement.check(max(action.h), where)
         limits.speed.check(action.speed, where)
         for level in action.voltage:
             limits.voltage.check(level, where)
-        prediction = predict(action, specimen)
+        path = (frozenset(action.h), frozenset(action.voltage), action.moves)
+        if path not in known:
+            known[path] = predict(action, specimen)
+        prediction = known[path]
+        no_taut_state = f"{where}: the model has no taut state there. {prediction.status.message}"
+        if prediction.status not in (Status.TAUT, Status.WRINKLED):
+            raise LimitError(no_taut_state)
         limits.force.check(prediction.peak_force, f"{where}, predicted")
         limits.field.check(prediction.peak_field, f"{where}, predicted")
         limits.hoop_stress.check(prediction.minimum_hoop_stress, f"{where}, predicted")
-        if prediction.status is not Status.TAUT:
-            raise LimitError(f"{where}: the model has no taut state there ({prediction.status.message}).")
+        if prediction.status is Status.WRINKLED:
+            raise LimitError(no_taut_state)
         predictions.append(prediction)
     return predictions

@@ -46,7 +46,7 @@ def _lines(title: str) -> Iterator[Callable[[float, float, str], None]]:
         nonlocal last
         if label != last:
             last = label
-            left = f"{clock.now() * (total - done) / done:4.0f} s left" if done > 0 else ""
+            left = f"{clock.now() * (total - done) / done:4.0f} s left" if done > 0.01 * total else ""
             click.echo(f"  {100 * done / total:3.0f} %  {left:11}  {label}", err=True)
 
     yield update

@@ -38,6 +38,7 @@ class MaterialTable(Table):
     def _same_length(self) -> Self:
         if len(self.mu_Pa) != len(self.alpha):
             raise ValueError(f"mu_Pa has {len(self.mu_Pa)} terms and alpha {len(self.alpha)}; they must pair up")
+        self.material("here")  # whatever else the model refuses
         return self
 
     def material(self, name: str) -> Material:

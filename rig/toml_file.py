@@ -32,7 +32,7 @@ def read_text(path: Path, kind: str) -> str:
     if len(data) > MAX_BYTES:
         raise ConfigError(f"{path}: larger than {MAX_BYTES // 1024} kB; this is not a {kind} file.")
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text (byte {error.start}); a {kind} file is TOML text.") from None
 
@@ -81,7 +81,7 @@ def _explain(error: ValidationError, table: type[Table], kind: str, source: str)
             near = difflib.get_close_matches(str(location[-1]), allowed, n=1, cutoff=0.5)
             hint = f"; did you mean {near[0]}?" if near else ""
             listing = f" Allowed here: {', '.join(allowed)}." if allowed else ""
-            lines.append(f"  {key}: unknown key{hint}{listing}")
+            lines.append(f"  {key}: unknown key{hint}.{listing}")
         elif problem["type"] == "missing":
             lines.append(f"  {key}: this key is missing.")
         else:

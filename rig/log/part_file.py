@@ -24,9 +24,10 @@ class PartFile:
         self._size = 0
         for existing in (self.path, self.part):
             if existing.exists():
-                raise LogError(
-                    existing, "exists already", "Nothing is overwritten: name another file, or move this one away."
-                )
+                advice = "Nothing is overwritten: name another file, or move this one away."
+                if existing == self.part:
+                    advice = f"An interrupted run left it; save what it holds: dea-rig recover {existing} -o OUT.mcap"
+                raise LogError(existing, "exists already", advice)
         try:
             self._fd: int | None = os.open(self.part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
             _sync_directory(self.part.parent)

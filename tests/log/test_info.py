@@ -36,7 +36,12 @@ def test_a_damaged_log_says_so(small):
 def test_devices_and_control_characters(tmp_path):
     with LogWriter(tmp_path / "a.mcap") as log:
         log.metadata("run", {"scene": "\x1b[31mred"})
-        event = {"t_s": 0.0, "severity": "info", "source": "stage", "message": "model X, serial \x1b]0,owned\x07; rate=100"}
+        event = {
+            "t_s": 0.0,
+            "severity": "info",
+            "source": "stage",
+            "message": "model X, serial \x1b]0,owned\x07; rate=100",
+        }
         log.write("/event", event, 0, 0)
         log.write("/raw/stage/rx", {"t_s": 0.0, "data": b"x"}, 0, 0)
         log.finish({})

@@ -188,6 +188,37 @@ def test_a_protocol_beyond_a_limit_is_refused_before_anything_is_opened(tmp_path
     assert not out.exists() and not out.with_name("x.mcap.part").exists()
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("mu_Pa = [33e3, 32e3]", "mu_Pa = [-33e3, -32e3]", "mu"),
+        ("alpha = [2.0, 5.0]", "alpha = [0.0, 5.0]", "alpha"),
+    ],
+)
+def test_a_material_that_the_model_refuses(tmp_path: Path, old: str, new: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load_scene(edited(tmp_path, SCENE, old, new))
+
+
+def test_outputs_are_never_written_over_anything(tmp_path: Path) -> None:
+    log = tmp_path / "precious.mcap"
+    log.write_bytes(b"precious")
+    for arguments in (
+        ["fit", str(log), "-o", str(log)],
+        ["fit", str(log), "--report", str(log)],
+        ["view", str(log), "--save", str(log)],
+        ["view", str(log), "--screenshot", str(log)],
+        ["run", str(SCENE), str(PROTOCOL), "-o", str(log)],
+        ["fit", str(log), "-o", str(tmp_path / "nowhere" / "fit.json")],
+        ["fit", str(log), "-o", str(tmp_path / "a"), "--report", str(tmp_path / "a")],
+        ["run", str(SCENE), str(PROTOCOL), "-o", ""],
+    ):
+        result = CliRunner().invoke(main, arguments)
+        assert result.exit_code == 2, arguments
+        assert "Traceback" not in result.output
+    assert log.read_bytes() == b"precious" and len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_port_that_does_not_exist(tmp_path: Path) -> None:
     text = SCENE.read_text()
     for role in ("zaber", "gsv8", "keyence-lkg"):
