@@ -253,7 +253,9 @@ def _check(tolerance: float, wrinkling: str) -> None:
         raise ValueError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
 
 
-def _quick(specimen: Specimen, h: float, voltage: float, tolerance: float, wrinkling: Wrinkling) -> Solution | None:
+def _quick(
+    specimen: Specimen, h: float, voltage: float, tolerance: float, near: single.Found | None
+) -> Solution | None:
     """An easy state, solved without arrays; None when it is not one."""
     m, t, b, lp = specimen.material, specimen.thickness, specimen.ring_radius, specimen.prestretch
     if h == 0.0 or not (math.isfinite(h) and math.isfinite(voltage)) or tolerance < 1e-11:
@@ -267,12 +269,12 @@ def _quick(specimen: Specimen, h: float, voltage: float, tolerance: float, wrink
         height=abs(h) / b,
     )
     count = Evaluations()
-    found = single.solve(film, tolerance, count)
+    found = None if near is None else single.solve(film, tolerance, count, near)
+    if found is None:
+        found = single.solve(film, tolerance, count)
     if found is None or found.softening > SOFTENING or found.meridional <= 0.0:
         return None
-    wrinkled = found.hoop < FLAT
-    # Beyond loss of tension slack must be ruled out, and folds may be asked for.
-    if wrinkled:
+    if found.hoop < FLAT:  # slack must be ruled out, and folds may be asked for
         return None
     force = 2.0 * math.pi * b * t * shear / lp**2 * found.lam
     peak, stretch = abs(voltage) / t * math.exp(found.log_area), math.exp(found.log_stretch)
@@ -319,11 +321,15 @@ def solve(
     tolerance: float = 1e-8,
     wrinkling: Wrinkling = "plain",
     sensitivities: bool = False,
+    near: Solution | None = None,
 ) -> Solution:
-    """Solve one state: `solve_many` for scalars, with the profiles at hand."""
+    """Solve one state: `solve_many` for scalars, with the profiles at hand.
+
+    ``near``, the solution of a like state, shortens the way to a taut one; the answer does not depend on it.
+    """
     _check(tolerance, wrinkling)
     if not sensitivities:
-        quick = _quick(specimen, float(h), float(voltage), tolerance, wrinkling)
+        quick = _quick(specimen, float(h), float(voltage), tolerance, near.quick if near else None)
         if quick is not None:
             return quick
     many, kept = _solve(_Inputs.gather(specimen, float(h), float(voltage)), tolerance, wrinkling, sensitivities)

@@ -129,6 +129,13 @@ class _Solver:
         scale = film.height / sum(o * x for o, x in zip(self.once, w, strict=True))
         return [0.0] * self.modes, [scale * x for x in w]
 
+    def carried(self, near: Found) -> tuple[Floats, Floats]:
+        """Another state of such a film, its slopes raised to the height of this one."""
+        c = near.c[: self.modes] + [0.0] * (self.modes - near.modes)
+        w = (ritz.transfer(near.modes, self.modes) @ near.w).tolist()
+        scale = self.film.height / sum(o * x for o, x in zip(self.once, w, strict=True))
+        return c, [scale * x for x in w]
+
     def step(self, c: Floats, w: Floats) -> tuple[Floats, Floats, float, float, bool, float]:
         """State after a Newton step, force, largest change of a slope, stability, tail; as in `model.ritz`."""
         film, lists, dxi = self.film, self.lists, self.dxi
@@ -346,21 +353,21 @@ def _eliminate(
     return right, diagonal, positive
 
 
-def solve(film: Film, tolerance: float, count: Evaluations) -> Found | None:
-    """The state to ``tolerance``, or None when it is not an easy one."""
+def solve(film: Film, tolerance: float, count: Evaluations, near: Found | None = None) -> Found | None:
+    """The state to ``tolerance``, or None when it is not an easy one; ``near`` is a state to begin from."""
     if film.span > ritz.LONGEST:
         return None
     try:
-        return _climb(_Solver(film, count), tolerance)
+        return _climb(_Solver(film, count), tolerance, near)
     except (ValueError, OverflowError, ZeroDivisionError):
         return None
 
 
-def _climb(solver: _Solver, tolerance: float) -> Found | None:
+def _climb(solver: _Solver, tolerance: float, near: Found | None) -> Found | None:
     goal = ladder.goal(tolerance)
     modes = max(2, ladder.first_modes(solver.film.span, tolerance))
     solver.lay(modes)
-    c, w = solver.guess()
+    c, w = solver.guess() if near is None else solver.carried(near)
     previous = math.nan
     steps = 0
     while modes <= MOST_MODES:

@@ -314,3 +314,12 @@ def test_the_path_for_one_state_has_the_digits_of_the_path_for_many() -> None:
                 for name in names:
                     assert getattr(one, name) == pytest.approx(getattr(many, name)[0], rel=1e-9, abs=1e-6), name
     assert compared > 60
+
+
+def test_a_solution_nearby_shortens_the_way_and_changes_no_answer() -> None:
+    near = solve(film(), 9.9e-3, 1480.0)
+    cold, warm = solve(film(), 10e-3, 1500.0), solve(film(), 10e-3, 1500.0, near=near)
+    assert warm.iterations < cold.iterations
+    assert warm.force == pytest.approx(cold.force, rel=1e-8)
+    other = solve(film(8, 1.0), 10e-3, near=near)
+    assert other.force == pytest.approx(solve(film(8, 1.0), 10e-3).force, rel=1e-8)
