@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from drivers.link import DeviceError, DeviceLost
-from rig.errors import FaultError, LimitError, Stopped
+from rig.errors import ConfigError, FaultError, LimitError, Stopped
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
@@ -156,6 +156,13 @@ def test_a_sensor_far_off_at_zero_is_refused(tell: Tell) -> None:
 def test_a_film_met_before_the_approach_begins_is_a_fault(tell: Tell) -> None:
     story = tell(replace=("contact_position_mm = 40.0", "contact_position_mm = 33.0"))
     assert isinstance(story.error, FaultError) and "met something before 36 mm" in story.outcome.reason
+
+
+def test_an_instrument_with_another_serial_number_is_refused_before_anything_moves(tell: Tell) -> None:
+    story = tell(replace=('driver = "zaber"', 'driver = "zaber"\nserial = "4711"'))
+    assert isinstance(story.error, ConfigError) and "4711" in str(story.error) and "swapped" in str(story.error)
+    assert not {"home", "move_to"} & set(story.stage_words) and not story.control_words
+    assert story.outcome.safe
 
 
 def test_a_certificate_of_another_sensor_is_told_in_the_log(tell: Tell) -> None:

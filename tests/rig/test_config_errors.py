@@ -200,6 +200,18 @@ def test_a_material_that_the_model_refuses(tmp_path: Path, old: str, new: str, w
         load_scene(edited(tmp_path, SCENE, old, new))
 
 
+@pytest.mark.parametrize("command", ["fit", "info", "view", "export", "recover"])
+def test_a_log_that_is_no_log(tmp_path: Path, command: str) -> None:
+    text = tmp_path / "notes.txt"
+    text.write_text("not a log\n" * 50)
+    output = {"fit": ["-o"], "view": ["--save"], "export": ["-o"], "recover": ["-o"]}.get(command, [])
+    arguments = [command, str(text), *output, *([str(tmp_path / "out.csv")] if output else [])]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 1, result.output
+    assert "notes.txt" in result.output and "not a log" in result.output and "Traceback" not in result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
 def test_outputs_are_never_written_over_anything(tmp_path: Path) -> None:
     log = tmp_path / "precious.mcap"
     log.write_bytes(b"precious")
