@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import warnings
 
@@ -81,8 +82,14 @@ def test_cubic_law_goes_over_into_large_deflections() -> None:
     assert np.all(power > 2.0)
 
 
-def check(specimens: list[Specimen], h: np.ndarray, voltage: np.ndarray, wrinkling: str) -> tuple[int, int]:
-    """Statuses and numbers belong together, no warning, none wrong by more than ten estimates; answers, comparisons."""
+def check(
+    specimens: list[Specimen], h: np.ndarray, voltage: np.ndarray, wrinkling: str, compare: int | None = None
+) -> tuple[int, int]:
+    """Statuses and numbers belong together, no warning, none wrong by more than ten estimates; answers, comparisons.
+
+    The reference is a hundred times slower than what it judges: ``compare`` has it judge that many states, drawn at
+    random, in place of all.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = solve_many(specimens, h, voltage, tolerance=1e-6, wrinkling=wrinkling)
@@ -91,10 +98,13 @@ def check(specimens: list[Specimen], h: np.ndarray, voltage: np.ndarray, wrinkli
         assert np.array_equal(np.isfinite(getattr(found, name)), answered), name
     assert np.all(found.error_estimate[answered] <= 1e-6)
     assert np.all(found.min_meridional_stress[answered] > 0.0)
-    truth = reference(specimens, h, voltage, wrinkling=wrinkling)
-    both = answered & truth.converged
-    wrong = np.abs(found.force / truth.force - 1.0) > 10.0 * found.error_estimate
-    assert not np.any(wrong & both), np.flatnonzero(wrong & both)
+    judged = np.arange(len(specimens))
+    if compare is not None:
+        judged = np.sort(np.random.default_rng(3).choice(judged, compare, replace=False))
+    truth = reference([specimens[k] for k in judged], h[judged], voltage[judged], wrinkling=wrinkling)
+    both = answered[judged] & truth.converged
+    wrong = np.abs(found.force[judged] / truth.force - 1.0) > 10.0 * found.error_estimate[judged]
+    assert not np.any(wrong & both), judged[wrong & both]
     return int(answered.sum()), int(both.sum())
 
 
@@ -130,17 +140,22 @@ def test_nothing_goes_unsaid() -> None:
     assert compared > 0.5 * len(films)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("wrinkling", ["plain", "tension_field"])
-def test_nothing_goes_unsaid_on_five_thousand_states(wrinkling: str) -> None:
-    films, h, v = grid(
+@functools.cache
+def wide_grid() -> tuple:
+    return grid(
         [1e-5, 1e-3, 0.02, 0.3, 0.9],
         [1.0, 1.2, 2.0],
         [5e-8, 1e-3, 0.03, 0.3, 1.0, 3.0],
         [0, 0.5, 0.9, 1.0, 1.1, 1.5, 2, 3],
     )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("wrinkling", ["plain", "tension_field"])
+def test_nothing_goes_unsaid_on_five_thousand_states(wrinkling: str) -> None:
+    films, h, v = wide_grid()
     assert len(films) >= 5000
-    answered, compared = check(films, h, v, wrinkling)
+    answered, compared = check(films, h, v, wrinkling, compare=600)
     assert answered > 0.4 * len(films)
-    assert compared > 0.3 * len(films)
+    assert compared > 0.3 * 600
