@@ -220,6 +220,8 @@ def _reason(error: Exception) -> str:
 
 
 def _ask_low_latency(port: serial.Serial) -> str:
+    if not hasattr(port, "set_low_latency_mode"):
+        return "not available (not on this operating system)"
     try:
         port.set_low_latency_mode(True)
     except _UNUSABLE as error:

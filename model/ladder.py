@@ -23,7 +23,7 @@ MOST_STEPS = 25
 NEWTON_FACTOR = 0.3
 RUNG_FACTOR = 0.5
 ROUND_OFF = 1e-13
-FOLDED = -1e-3  # of G: a hoop stress below it will not turn out positive on a finer rung
+FOLDED = -1e-2  # of the meridional stress: a hoop stress below it will not turn out positive on a finer rung
 LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two rungs may agree by chance
 
 
@@ -39,7 +39,7 @@ class Iterate:
     stable: NDArray[np.bool_]
     ok: NDArray[np.bool_]
     steps: NDArray[np.intp]
-    hoop: Array | None = None  # least hoop stress at the points before the last step
+    hoop: Array | None = None  # least hoop over largest meridional stress at the points, before the last step
 
 
 Settle = Callable[[Problem, Grid, State, float], Iterate]
@@ -124,7 +124,8 @@ def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
             break
         if n >= 4 and states > 1 and done.mean() > 0.5:
             rest = np.flatnonzero(~done)
-            ends, hoop = tail(problem, grid, state, step), at.law.t2.min(axis=(0, 1))
+            ends = tail(problem, grid, state, step)
+            hoop = at.law.t2.min(axis=(0, 1)) / at.law.t1.max(axis=(0, 1))
             more = newton(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n)
             state.put(rest, more.state)
             lam[rest], change[rest], stable[rest], ends[rest] = more.lam, more.change, more.stable, more.tail
@@ -133,7 +134,7 @@ def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
             ok = (change <= goal) & stable & (lam > 0.0)
             return Iterate(grid, state, lam, change, ends, stable, ok, steps, hoop)
     ends = tail(problem, grid, state, step)
-    hoop = at.law.t2.min(axis=(0, 1))
+    hoop = at.law.t2.min(axis=(0, 1)) / at.law.t1.max(axis=(0, 1))
     return Iterate(grid, state, lam, change, ends, stable, done & stable & (lam > 0.0), steps, hoop)
 
 

@@ -211,6 +211,11 @@ class Bench:
                     )
                     self.devices[role] = self.hv
 
+    def link_settings(self, role: str) -> dict[str, str]:
+        """What the link of ``role`` set and what its adapter made of it; nothing for links in memory."""
+        link = self._byte_links.get(role) or self._frame_links.get(role)
+        return dict(getattr(link, "settings", {}))
+
     def close(self) -> None:
         """Close every device and link, whatever state they are in; one that fails does not keep the others open."""
         closing = [device.close for device in self.devices.values()]

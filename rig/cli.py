@@ -6,6 +6,7 @@ Heavy things are imported inside the commands that use them, so that ``dea-rig -
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -127,8 +128,12 @@ def sim(scene: Path) -> None:
     """Serve the simulated bench of SCENE on pseudo-terminals until stopped; prints the ports as JSON."""
     from rig.bench import simulated_bench
     from rig.clock import RealClock
+    from rig.errors import ConfigError
     from rig.scene import load_scene
     from rig.signals import stop_on_signals
+
+    if os.name != "posix":
+        raise ConfigError("The bench is served on pseudo-terminals, which this system lacks. Run it in memory.")
     from rig.sim.server import Server
 
     loaded, _ = load_scene(scene)

@@ -190,6 +190,9 @@ class Engine:
         rest = Teardown(self.bench, self._guard, self.recorder, self._stop).run(
             reason, status in ("complete", "stopped"), self._next_turn
         )
+        for role, device in self.bench.devices.items():
+            counted = ", ".join(f"{key}={value}" for key, value in sorted(device.counters.items()) if value)
+            self.recorder.event("info", role, f"counted: {counted or 'nothing'}")
         if error is not None:
             self.recorder.event("error", "engine", reason)
         return self._outcome(status, reason, rest), error
@@ -231,7 +234,8 @@ class Engine:
     def _check_identity(self, role: str) -> None:
         table, device = self.bench.scene.instruments[role], self.bench.devices[role]
         found = device.identity
-        settings = ", ".join(f"{key}={value}" for key, value in sorted(device.settings.items()))
+        known = {**device.settings, **self.bench.link_settings(role)}
+        settings = ", ".join(f"{key}={value}" for key, value in sorted(known.items()))
         self.recorder.event(
             "info", role, f"model {found.model}, serial {found.serial}, firmware {found.firmware}; {settings}"
         )

@@ -29,7 +29,9 @@ class PartFile:
                     advice = f"An interrupted run left it; save what it holds: dea-rig recover {existing} -o OUT.mcap"
                 raise LogError(existing, "exists already", advice)
         try:
-            self._fd: int | None = os.open(self.part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+            self._fd: int | None = os.open(
+                self.part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644
+            )
             _sync_directory(self.part.parent)
         except OSError as error:
             raise LogError(path, f"cannot be made ({error.strerror})", "Name a directory you can write to.") from error
@@ -103,6 +105,8 @@ class PartFile:
 
 
 def _sync_directory(directory: Path) -> None:
+    if os.name == "nt":  # a directory cannot be opened there, and its entries need no sync
+        return
     fd = os.open(directory, os.O_RDONLY)
     try:
         os.fsync(fd)

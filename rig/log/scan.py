@@ -97,7 +97,7 @@ class Source:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self._fd = os.open(path, os.O_RDONLY)
+            self._fd = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         except FileNotFoundError:
             raise LogError(path, "there is no such file", "Check the name.") from None
         except OSError as error:
@@ -119,7 +119,8 @@ class Source:
         parts: list[bytes] = []
         try:
             while length > 0:
-                part = os.pread(self._fd, length, offset)
+                os.lseek(self._fd, offset, os.SEEK_SET)
+                part = os.read(self._fd, length)
                 if not part:
                     break
                 parts.append(part)

@@ -192,13 +192,14 @@ class SimulatedBench:
             raise ValueError(f"there is no {fault.role} on this bench to go wrong")
         self.settings.check(fault)
         self._injected += 1
+        number = self._injected  # switching may inject further faults
         begin = max(fault.at_s, self.now)
         if begin > self.now:
-            heapq.heappush(self._due, (begin, 2 * self._injected, True, fault))
+            heapq.heappush(self._due, (begin, 2 * number, True, fault))
         else:
-            self._switch(fault, 2 * self._injected, True, self.now)
+            self._switch(fault, 2 * number, True, self.now)
         if fault.duration_s is not None:
-            heapq.heappush(self._due, (begin + fault.duration_s, 2 * self._injected + 1, False, fault))
+            heapq.heappush(self._due, (begin + fault.duration_s, 2 * number + 1, False, fault))
 
     def _switch(self, fault: Fault, number: int, begins: bool, t: float) -> None:
         if fault.kind == "vanish":

@@ -162,6 +162,13 @@ def test_every_way_to_vanish_at_every_call(link: SerialLink, where: str, error: 
         link._serial = real
 
 
+def test_a_system_without_low_latency_mode_opens_its_ports(other_end: Pty, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(serial.Serial, "set_low_latency_mode")
+    link = SerialLink("stage", other_end.port, 115200)
+    assert "not available" in link.settings["low_latency"]
+    link.close()
+
+
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), termios.error(5, "Input/output error")])
 def test_close_of_a_vanished_port_is_quiet_and_releases_the_lock(
     link: SerialLink, other_end: Pty, error: Exception

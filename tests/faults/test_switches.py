@@ -111,8 +111,8 @@ def test_tolerated(tell: Tell, role: str, kind: str, more: dict[str, Any]) -> No
 def test_ends_safe(tell: Tell, role: str, kind: str, more: dict[str, Any]) -> None:
     story = tell(begin(role, kind, more))
     assert story.outcome.status in ("fault", "limit"), story.outcome
-    assert abs(story.final_output) < 60 or (role, kind) == ("hv", "vanish")
-    assert story.took < 4.0
+    assert abs(story.final_output) < 60 and story.outcome.safe
+    assert story.off_after < 2.5
     assert read_log(story.log).outcome["status"] == story.outcome.status  # type: ignore[index]
 
 

@@ -176,3 +176,17 @@ def test_small_disk() -> None:
     truth = reference(small, 10e-3, v, wrinkling="tension_field")
     assert found.answered.all()
     np.testing.assert_allclose(found.force, truth.force, rtol=1e-7)
+
+
+def test_folds_of_a_film_raised_by_a_nanometre() -> None:
+    """Its stresses are 1e-15 of the modulus; whether they are tension is a question of their sign all the same."""
+    h = 1e-9
+    taut = solve(film(), h)
+    v = np.sqrt(taut.min_hoop_stress / PARKER.permittivity) * 40e-6 * np.array([0.5, 0.9, 1.1])
+    found = solve_many(film(), h, v, wrinkling="tension_field")
+    truth = reference(film(), h, v, wrinkling="tension_field")
+    np.testing.assert_array_equal(found.status == Status.WRINKLED, truth.wrinkled)
+    assert truth.wrinkled.any()
+    np.testing.assert_allclose(found.force, truth.force, rtol=1e-8)
+    plain = solve_many(film(), h, v)
+    np.testing.assert_array_equal(plain.status, found.status)
