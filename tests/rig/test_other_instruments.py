@@ -159,6 +159,7 @@ def test_a_certificate_for_other_readings_is_refused_before_anything_moves(tmp_p
     assert story.highest_output == 0.0
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_run(tmp_path: Path) -> None:
     protocol = tmp_path / "protocol.toml"
     protocol.write_text(PROTOCOL)
@@ -184,6 +185,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
 def test_over_pseudo_terminals_and_slcan_in_real_time(tmp_path: Path) -> None:
     text = SCENE.read_text()
