@@ -50,7 +50,8 @@ def run_demo(out: Path | None, seed: int) -> None:
     fit, report = folder / "fit.json", folder / "report.html"
     write_results(found, fit, report)
     show(identification_table(found.identification), truth_table(found))
-    click.echo(f"Left in {folder}/: two logs, {fit.name}, {report.name}, and the files they came from. Try next:")
+    click.echo(f"Left in {folder}/: two logs, {fit.name}, {report.name}, and the files they came from.")
+    click.echo("Try next, with `uv run` in front:")
     click.echo(f"  dea-rig view {logs[0]}")
     click.echo(f"  dea-rig check {folder}/scenes/{SCENES[0]}.toml {folder}/protocols/{PROTOCOL}.toml")
     click.echo("  change a number there, then: dea-rig run SCENE PROTOCOL -o my.mcap && dea-rig fit my.mcap")
