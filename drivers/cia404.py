@@ -262,6 +262,8 @@ _Got = Answer[Message]
 # Nearest event timer, in milliseconds, and how far the rate may be from the one asked for.
 _RATE_TOLERANCE = 0.01
 
+_LIMIT_MV_PER_V = 100.0
+
 
 class CiA404:
     """A force sensor on one analogue input of a CiA 404 node, streaming by event timer.
@@ -272,8 +274,9 @@ class CiA404:
     a number can be told to be invalid.
 
     The reading is in newtons, or in mV/V if the device is set so; for any other unit ``unit`` and ``factor`` must say
-    what its values are. A value that is not finite, in a PDO that calls it valid, is dropped and counted
-    (``bad_values``). While an emergency is reported the samples carry ``SENSOR_ERROR``.
+    what its values are. A value that is not finite or beyond ``limit_N`` (100 mV/V), in a PDO that calls it valid, is
+    counted (``bad_values``); its sample is NaN with ``NO_VALUE``. While an emergency is reported the samples carry
+    ``SENSOR_ERROR``.
 
     Parameters
     ----------
@@ -290,6 +293,8 @@ class CiA404:
         Longest time between two polls.
     unit, factor
         Reading unit and what to multiply the device's value with, instead of the unit it states.
+    limit_N : float
+        Largest magnitude of a reading in newtons that is believed.
     """
 
     def __init__(
@@ -304,6 +309,7 @@ class CiA404:
         poll_interval_s: float = 0.01,
         unit: Literal["N", "mV/V"] | None = None,
         factor: float = 1.0,
+        limit_N: float = 1e4,
     ) -> None:
         where = label(name, link)
         if not 1 <= node <= 127:
@@ -335,6 +341,7 @@ class CiA404:
         self._interval = poll_interval_s
         self._stated = (unit, factor) if unit is not None else None
         self._factor = factor
+        self._limit_N = limit_N
         self._decoder = Decoder(node, self.counters)
         self._dialogue: Dialogue[_Request, Message] = Dialogue(
             where,
@@ -344,7 +351,7 @@ class CiA404:
             advice=f"Check power, CAN cable and termination, bit rate, and that the device is node {node}.",
         )
         self._layout = Layout((), channel)
-        self._clock: SampleClock[ForceSample | None] | None = None
+        self._clock: SampleClock[ForceSample] | None = None
         self._heard = math.inf
         self._emergency = 0
         self._polls = 0
@@ -382,7 +389,7 @@ class CiA404:
             frames = []
             self._link.write(nmt(self._node, "pre-operational"))
             self._dialogue.begin(self._set_up())
-        arrived: list[ForceSample | None] = []
+        arrived: list[ForceSample] = []
         for frame in frames:
             match self._decoder.feed(frame):
                 case None:
@@ -409,7 +416,7 @@ class CiA404:
 
     # -- stream -----------------------------------------------------------------------------------------------------
 
-    def _sample(self, data: bytes) -> ForceSample | None:
+    def _sample(self, data: bytes) -> ForceSample:
         value, status = self._layout.take(data)
         reading = value * self._factor
         flags = SampleFlag.SENSOR_ERROR if self._emergency else SampleFlag(0)
@@ -420,9 +427,9 @@ class CiA404:
         self.counters["overloads"] += bool(status & 6)
         if status & 1:
             return ForceSample(math.nan, math.nan, flags | SampleFlag.NO_VALUE)
-        if not math.isfinite(reading):
+        if not abs(reading) <= (self._limit_N if self.reading_unit == "N" else _LIMIT_MV_PER_V):
             self.counters["bad_values"] += 1
-            return None
+            return ForceSample(math.nan, math.nan, flags | SampleFlag.NO_VALUE)
         return ForceSample(math.nan, reading, flags)
 
     def _check_state(self, state: int) -> None:
@@ -435,13 +442,13 @@ class CiA404:
             "Check its supply. Its tare and settings may be gone.",
         )
 
-    def _stamp(self, now: float, arrived: list[ForceSample | None]) -> list[ForceSample]:
+    def _stamp(self, now: float, arrived: list[ForceSample]) -> list[ForceSample]:
         clock = self._clock
         if clock is None:
             return []
         self._heard = min(self._heard, now)
-        samples = [ForceSample(t, s.reading, s.flags) for t, s in clock.feed(now, arrived) if s is not None]
-        if any(s is not None for s in arrived):
+        samples = [ForceSample(t, s.reading, s.flags) for t, s in clock.feed(now, arrived)]
+        if arrived:
             self._heard = now
         elif now - self._heard > max(self._timeout, 5.0 / self._rate):
             silent_s, self._heard = now - self._heard, now

@@ -31,6 +31,7 @@ from dataclasses import dataclass
 from typing import NoReturn, TypeVar
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.lines import LineSplitter
 from drivers.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import OK, DisplacementSample, Identity, SampleFlag
 
@@ -131,30 +132,13 @@ class Codec:
 
     def __init__(self, counters: dict[str, int] | None = None) -> None:
         self.counters = {} if counters is None else counters
-        for key in ("bad_grammar", "too_long"):
-            self.counters.setdefault(key, 0)
-        self._buffer = bytearray()
-        self._skipping = False
+        self.counters.setdefault("bad_grammar", 0)
+        self._lines = LineSplitter(b"\r", _MAX_LINE, self.counters)
 
     def feed(self, data: bytes) -> list[Message]:
         """The messages that ``data`` completes, in order."""
-        messages: list[Message] = []
-        self._buffer += data
-        *lines, rest = self._buffer.split(b"\r")
-        for line in lines:
-            if self._skipping:
-                self._skipping = False
-            elif len(line) > _MAX_LINE:
-                self.counters["too_long"] += 1
-            elif (message := self._line(bytes(line.removeprefix(b"\n")))) is not None:
-                messages.append(message)
-        if len(rest) > _MAX_LINE:
-            if not self._skipping:
-                self.counters["too_long"] += 1
-            self._skipping = True
-            rest = bytearray()
-        self._buffer = rest
-        return messages
+        messages = (self._line(line.removeprefix(b"\n")) for line in self._lines.feed(data))
+        return [message for message in messages if message is not None]
 
     def _line(self, line: bytes) -> Message | None:
         if not line:

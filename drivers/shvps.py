@@ -28,6 +28,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import TypeVar
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.lines import LineSplitter
 from drivers.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, Identity
 
@@ -41,6 +42,7 @@ LONGEST_STEP_S = 0.25
 """A ramp does not make up for time in which nobody polled."""
 
 _MAX_LINE = 64
+_LINE = re.compile(rb"[ -~]+\r")
 _NUMBER = re.compile(r"-?[0-9]{1,6}")
 _VERSION = re.compile(r"(slave|master) ([0-9]{1,4})")
 _UNSAFE = "Take the high voltage away by hand: pull the power jack, then ground the electrodes."
@@ -57,30 +59,14 @@ class Codec:
 
     def __init__(self, counters: dict[str, int] | None = None) -> None:
         self.counters = {} if counters is None else counters
-        for key in ("bad_grammar", "too_long"):
-            self.counters.setdefault(key, 0)
-        self._buffer = bytearray()
-        self._skipping = False
+        self.counters.setdefault("bad_grammar", 0)
+        self._lines = LineSplitter(b"\n", _MAX_LINE, self.counters)
 
     def feed(self, data: bytes) -> list[str]:
         """The lines that ``data`` completes, in order."""
-        lines: list[str] = []
-        self._buffer += data
-        *complete, rest = self._buffer.split(b"\n")
-        for line in complete:
-            if self._skipping:
-                self._skipping = False
-            elif len(line) > _MAX_LINE:
-                self.counters["too_long"] += 1
-            elif re.fullmatch(rb"[ -~]+\r", line):
-                lines.append(line[:-1].decode("ascii"))
-            else:
-                self.counters["bad_grammar"] += 1
-        if len(rest) > _MAX_LINE:
-            self.counters["too_long"] += not self._skipping
-            self._skipping = True
-            rest = bytearray()
-        self._buffer = rest
+        complete = self._lines.feed(data)
+        lines = [line[:-1].decode("ascii") for line in complete if _LINE.fullmatch(line)]
+        self.counters["bad_grammar"] += len(complete) - len(lines)
         return lines
 
 

@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.lines import LineSplitter
 from drivers.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import Identity, StageSample
 
@@ -165,32 +166,16 @@ class Codec:
 
     def __init__(self, counters: dict[str, int] | None = None) -> None:
         self.counters = {} if counters is None else counters
-        for key in ("bad_checksum", "without_checksum", "bad_grammar", "too_long", "lost_continuation"):
+        for key in ("bad_checksum", "without_checksum", "bad_grammar", "lost_continuation"):
             self.counters.setdefault(key, 0)
         self.checksums_seen = self._alert_checksums_seen = False
-        self._buffer = bytearray()
-        self._skipping = False
+        self._lines = LineSplitter(b"\n", _MAX_LINE, self.counters)
         self._unfinished: dict[tuple[int, int, int | None], list[Reply | Info]] = {}
 
     def feed(self, data: bytes) -> list[Message]:
         """The messages that ``data`` completes, in order."""
-        messages: list[Message] = []
-        self._buffer += data
-        *lines, rest = self._buffer.split(b"\n")
-        for line in lines:
-            if self._skipping:
-                self._skipping = False
-            elif len(line) > _MAX_LINE:
-                self.counters["too_long"] += 1
-            elif (message := self._line(bytes(line.removesuffix(b"\r")))) is not None:
-                messages.append(message)
-        if len(rest) > _MAX_LINE:
-            if not self._skipping:
-                self.counters["too_long"] += 1
-            self._skipping = True
-            rest = bytearray()
-        self._buffer = rest
-        return messages
+        messages = (self._line(line.removesuffix(b"\r")) for line in self._lines.feed(data))
+        return [message for message in messages if message is not None]
 
     def _line(self, line: bytes) -> Message | None:
         if not line:

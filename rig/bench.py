@@ -7,12 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Literal, Protocol
+from inspect import signature
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from drivers.link import ByteLink, CanFrame, FrameLink
 from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Stage
 from rig.clock import Clock, RealClock, VirtualClock
-from rig.scene import CanTable, CiA404Table, GSV8Table, IsegTable, KeyenceTable, Scene, ShvpsTable, ZaberTable
+from rig.scene import (
+    CanTable,
+    CiA404Table,
+    GSV8Table,
+    Instrument,
+    IsegTable,
+    KeyenceTable,
+    Scene,
+    ShvpsTable,
+    ZaberTable,
+)
 
 if TYPE_CHECKING:
     from rig.sim.bench import SimulatedBench
@@ -146,69 +157,32 @@ class Bench:
                 case ZaberTable():
                     from drivers.zaber import ZaberStage
 
-                    self.stage = ZaberStage(
-                        role,
-                        bytes_of(role),
-                        device=table.device,
-                        axis=table.axis,
-                        poll_rate_Hz=table.poll_rate_Hz,
-                        timeout_s=table.timeout_s,
-                    )
+                    self.stage = ZaberStage(role, bytes_of(role), **arguments(table, ZaberStage))
                     self.devices[role] = self.stage
                 case GSV8Table():
                     from drivers.gsv8 import GSV8
 
-                    self.force = GSV8(
-                        role, bytes_of(role), channel=table.channel, rate_Hz=table.rate_Hz, timeout_s=table.timeout_s
-                    )
+                    self.force = GSV8(role, bytes_of(role), **arguments(table, GSV8))
                     self.devices[role] = self.force
                 case CiA404Table():
                     from drivers.cia404 import CiA404
 
-                    self.force = CiA404(
-                        role,
-                        frames_of(role),
-                        node=table.node,
-                        channel=table.channel,
-                        rate_Hz=table.rate_Hz,
-                        timeout_s=table.timeout_s,
-                        unit=table.unit,
-                        factor=table.factor,
-                    )
+                    self.force = CiA404(role, frames_of(role), **arguments(table, CiA404))
                     self.devices[role] = self.force
                 case KeyenceTable():
                     from drivers.keyence_lkg import KeyenceLKG
 
-                    self.displacement = KeyenceLKG(
-                        role,
-                        bytes_of(role),
-                        output=table.output,
-                        poll_rate_Hz=table.poll_rate_Hz,
-                        timeout_s=table.timeout_s,
-                    )
+                    self.displacement = KeyenceLKG(role, bytes_of(role), **arguments(table, KeyenceLKG))
                     self.devices[role] = self.displacement
                 case IsegTable():
                     from drivers.iseg_edcp import IsegEDCP
 
-                    self.hv = IsegEDCP(
-                        role,
-                        frames_of(role),
-                        module=table.module,
-                        channel=table.channel,
-                        poll_rate_Hz=table.poll_rate_Hz,
-                        timeout_s=table.timeout_s,
-                    )
+                    self.hv = IsegEDCP(role, frames_of(role), **arguments(table, IsegEDCP))
                     self.devices[role] = self.hv
                 case ShvpsTable():
                     from drivers.shvps import Shvps
 
-                    self.hv = Shvps(
-                        role,
-                        bytes_of(role),
-                        poll_rate_Hz=table.poll_rate_Hz,
-                        timeout_s=table.timeout_s,
-                        ramp_V_per_s=table.ramp_V_per_s,
-                    )
+                    self.hv = Shvps(role, bytes_of(role), **arguments(table, Shvps))
                     self.devices[role] = self.hv
 
     def link_settings(self, role: str) -> dict[str, str]:
@@ -224,6 +198,11 @@ class Bench:
         for close in closing:
             with suppress(Exception):
                 close()
+
+
+def arguments(table: Instrument, driver: type[Device]) -> dict[str, Any]:
+    """What a scene says to a driver: the keys that are named like its arguments."""
+    return table.model_dump(include=set(signature(driver).parameters))
 
 
 def simulated_bench(scene: Scene) -> SimulatedBench:

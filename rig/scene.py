@@ -120,6 +120,7 @@ class ZaberTable(SerialTable):
     device: int = Field(default=1, ge=1, le=99)
     axis: int = Field(default=1, ge=1, le=9)
     poll_rate_Hz: float = Field(default=50.0, ge=5, le=200)
+    full_step_um: Positive = 31.75  # travel per full motor step: screw pitch over steps a turn, 6.35 mm / 200
     approach_from_mm: float = Field(default=0.0, ge=0)  # stage position, short of the film, where approaching begins
 
 
@@ -130,6 +131,13 @@ class GSV8Table(SerialTable):
     baud: int = Field(default=230400, gt=0)
     channel: int = Field(default=1, ge=1, le=8)
     rate_Hz: float = Field(default=100.0, gt=0, le=2000)
+    frame_type: Literal["float32", "int24", "int16"] = "float32"
+    # Float values are the signal in input ranges times the amplifier's user scale ("range"), or the signal in mV/V
+    # times it. Integers reach their end at int_full_scale input ranges. The range itself is asked of the amplifier
+    # unless it is given here.
+    user_scale_of: Literal["range", "mV/V"] = "range"
+    int_full_scale: float = Field(default=1.05, ge=0.5, le=2)
+    input_range_mV_per_V: float | None = Field(default=None, gt=0, le=1000)
     certificate: str
 
 
@@ -140,6 +148,8 @@ class KeyenceTable(SerialTable):
     baud: int = Field(default=115200, gt=0)
     output: int = Field(default=1, ge=1, le=2)
     poll_rate_Hz: float = Field(default=50.0, ge=5, le=200)
+    unit_mm: Positive = 1.0  # of the controller's display: 0.001 when it is set to micrometres
+    limit_mm: Positive = 80.0  # what the head can show at most; more is not believed
 
 
 class ShvpsTable(SerialTable):
@@ -179,6 +189,7 @@ class CiA404Table(CanTable):
     # For a device that states neither newtons nor mV/V: what its values are, once multiplied by the factor.
     unit: Literal["N", "mV/V"] | None = None
     factor: float = 1.0
+    limit_N: Positive = 1e4  # no larger reading is believed; set it to some times the capacity of the cell
     certificate: str
 
     @model_validator(mode="after")
@@ -198,6 +209,7 @@ class IsegTable(CanTable):
     module: int = Field(default=0, ge=0, le=63)
     channel: int = Field(default=0, ge=0, le=23)
     ramp_V_per_s: Positive = 100.0
+    max_ramp_percent_per_s: float = Field(default=20.0, gt=0, le=100)  # of nominal; what the module takes at most
     poll_rate_Hz: float = Field(default=10.0, gt=0, le=50)
 
 

@@ -340,12 +340,26 @@ def test_status_as_flags(status: int, flags: SampleFlag) -> None:
     assert math.isnan(rig.samples[-1].reading) == bool(status & 1)
 
 
-def test_a_value_that_is_no_number_is_dropped() -> None:
-    rig = Rig().until_ready()
-    rig.node.value = lambda k: math.nan if k == 20 else 1.0
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3.0, -3.0, 1e30])
+def test_a_value_that_cannot_be_is_counted_and_shows_as_no_value(value: float) -> None:
+    rig = Rig(limit_N=2.5).until_ready()
+    rig.node.value = lambda k: value if k == 20 else 2.375
     rig.run(0.5)
     assert rig.force.counters["bad_values"] == 1
-    assert {s.reading for s in rig.samples} == {1.0}
+    assert {s.reading for s in rig.samples if not s.flags} == {2.375}
+    (flagged,) = [s for s in rig.samples if s.flags]
+    assert flagged.flags == SampleFlag.NO_VALUE and math.isnan(flagged.reading)
+    assert rig.force.counters["lost_samples"] == 0
+
+
+def test_a_bridge_signal_has_a_limit_of_its_own() -> None:
+    node = Node()
+    node.objects[0x6131, 1] = struct.pack("<I", 0x0026_2600)
+    node.value = lambda k: 0.2 if k == 20 else 2**-9  # V/V
+    rig = Rig(node, limit_N=1e-3).until_ready()
+    rig.run(0.5)
+    assert rig.force.counters["bad_values"] == 1
+    assert {s.reading for s in rig.samples if not s.flags} == {1e3 * 2**-9}
 
 
 def test_an_emergency_marks_the_samples_until_it_is_over() -> None:

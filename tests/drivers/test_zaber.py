@@ -115,7 +115,7 @@ def test_line_without_end_does_not_fill_the_memory() -> None:
     codec = Codec()
     for _ in range(1000):
         assert codec.feed(b"x" * 1000) == []
-    assert len(codec._buffer) <= 512
+    assert codec._lines.held <= 512
     assert codec.counters["too_long"] == 1
     assert codec.feed(b"\n@01 1 29 OK BUSY -- 0:DC\r\n") == [Reply(1, 1, 29, True, True, "--", "0")]
 

@@ -117,7 +117,7 @@ def garbage(count: int) -> None:
     for _ in range(count):
         data = bytes(rng.choices(alphabet, k=30)) if rng.random() < 0.5 else rng.randbytes(30)
         codec.feed(data)
-        assert len(codec._buffer) <= 512 and len(codec._unfinished) <= 16
+        assert codec._lines.held <= 512 and len(codec._unfinished) <= 16
 
 
 def test_one_byte_changed_lost_or_added_is_never_a_wrong_reply() -> None:
