@@ -112,7 +112,7 @@ def test_a_supply_that_ramps_more_slowly() -> None:
 
 
 def test_a_can_load_cell_beyond_its_limit_has_no_value() -> None:
-    small = ("node = 5", "node = 5\nlimit_N = 1e-9")
+    small = ("limit_N = 5.0", "limit_N = 1e-9")
     with ready(small, scene="other-instruments") as (bench, samples):
         assert bench.devices["force"].counters["bad_values"] == len(samples["force"]) > 50
         assert all(sample.flags for sample in samples["force"])  # type: ignore[union-attr]
