@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Required, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Required, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.log.errors import LogError
-from rig.log.reader import Columns, Log, read_log
+from rig.log.reader import Columns, Log, read_tables
 
 if TYPE_CHECKING:
     from calibration.curve import Curve
@@ -196,16 +196,15 @@ def load_run(path: Path, latency: Mapping[str, float] | None = None) -> Run:
     rig.log.errors.LogError
         The log cannot be read, or holds no force samples.
     """
-    log = read_log(path)
+    log, tables = read_tables(path, (*_TOPICS, "/phase", "/reference"))
     if "/force/sample" not in log.topics:
         raise LogError(path, "holds no force samples", "There is nothing to align.")
-    tables = log.tables(_TOPICS)
     late = dict(latency or {})
     times = {topic: tables[topic]["t_s"] - late.pop(topic.split("/")[1], 0.0) for topic in _TOPICS}
     if late:
         raise ValueError(f"latency of {', '.join(late)}; roles are force, displacement, stage, hv")
-    phases = sorted((Phase(*message.fields.values()) for message in log.messages("/phase")), key=_time)
-    references = sorted((Reference(*message.fields.values()) for message in log.messages("/reference")), key=_time)
+    phases = [Phase(*row) for row in _rows_by_time(tables["/phase"])]
+    references = [Reference(*row) for row in _rows_by_time(tables["/reference"])]
 
     force = tables["/force/sample"]
     order = np.argsort(times["/force/sample"], kind="stable")
@@ -275,5 +274,6 @@ def _gain(force: Floats, net_reading: Floats) -> float:
     return float(force[largest] / net_reading[largest])
 
 
-def _time(row: Phase | Reference) -> float:
-    return row.t
+def _rows_by_time(table: Columns) -> list[tuple[Any, ...]]:
+    fields = [column.tolist() for name, column in table.items() if name not in ("log_ns", "publish_ns")]
+    return sorted(zip(*fields, strict=True), key=lambda row: row[0])

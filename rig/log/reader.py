@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections import defaultdict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +15,19 @@ from numpy.typing import NDArray
 
 from rig.log import schema
 from rig.log.errors import LogError
-from rig.log.scan import MAX_TABLES, ChannelInfo, Damaged, Gap, Record, Scan, Source, chunk_content, messages, spans
+from rig.log.scan import (
+    MAX_TABLES,
+    ChannelInfo,
+    Damaged,
+    Gap,
+    Messages,
+    Record,
+    Scan,
+    Source,
+    chunk_content,
+    messages,
+    rows,
+)
 
 Columns = dict[str, NDArray[Any]]
 
@@ -92,9 +103,11 @@ class Log:
 
     def messages(self, topic: str) -> Iterator[Message]:
         """The messages on one topic in the order of the file; none when the topic is not in the log."""
-        for _, row in self._rows({topic}):
-            log_ns, publish_ns = _TIMES.unpack_from(row)
-            yield Message(log_ns, publish_ns, self._decode(topic, row[_TIMES.size :]))
+        for channels, content, found in self._contents({topic}):
+            for _, mine in _by_topic(channels, found):
+                for k in np.flatnonzero(mine).tolist():
+                    payload = content[found.start[k] : found.end[k]]
+                    yield Message(int(found.log_ns[k]), int(found.publish_ns[k]), _decode(self.path, topic, payload))
 
     def columns(self, topic: str) -> Columns:
         """The messages on one topic as arrays of shape (n,): ``log_ns``, ``publish_ns`` and every field by its name.
@@ -105,59 +118,38 @@ class Log:
 
     def tables(self, topics: Collection[str]) -> dict[str, Columns]:
         """`columns` of several topics, in one pass over the file."""
-        rows: dict[str, list[bytes]] = {topic: [] for topic in topics}
-        for topic, row in self._rows(set(topics)):
-            rows[topic].append(row)
-        return {topic: self._columns(topic, of_topic) for topic, of_topic in rows.items()}
+        tables = _tables(self.path, topics)
+        for channels, content, found in self._contents(tables.keys()):
+            for topic, mine in _by_topic(channels, found):
+                tables[topic].add(content, found, mine)
+        return {topic: table.columns() for topic, table in tables.items()}
 
     def raw_messages(self) -> Iterator[tuple[ChannelInfo, int, int, int, bytes] | None]:
         """All messages as written: channel, sequence number, log time, publish time, payload; None ends each chunk."""
-        with Source(self.path) as source:
-            for chunk in self._chunks:
-                content = self._content(source, chunk)
-                for channel, sequence, log_ns, publish_ns, start, end in messages(content, dict(chunk.channels)):
-                    yield chunk.channels[channel], sequence, log_ns, publish_ns, content[start:end]
-                yield None
+        for channels, content, found in self._contents(None):
+            columns = (column.tolist() for column in found)
+            for number, sequence, log_ns, publish_ns, start, end in zip(*columns, strict=True):
+                yield channels[number], sequence, log_ns, publish_ns, content[start:end]
+            yield None
 
-    def _rows(self, topics: set[str]) -> Iterator[tuple[str, bytes]]:
-        """Topic, and log time, publish time and payload in one piece, of the messages on ``topics``."""
-        unknown = topics - schema.CHANNELS.keys()
-        if unknown:
-            raise LogError(self.path, f"no log has a topic {', '.join(sorted(unknown))}")
+    def _contents(self, topics: Collection[str] | None) -> Iterator[tuple[dict[int, ChannelInfo], bytes, Messages]]:
+        """The chunks that have messages on ``topics`` (None: all): their channels on these, content and messages."""
+        for topic in topics or ():
+            _check_topic(self.path, topic)
         with Source(self.path) as source:
             for chunk in self._chunks:
-                wanted = {number: info.topic for number, info in chunk.channels.items() if info.topic in topics}
-                if wanted:
+                channels = {
+                    n: channel for n, channel in chunk.channels.items() if topics is None or channel.topic in topics
+                }
+                if channels:
                     content = self._content(source, chunk)
-                    for channel, start, end in spans(content):
-                        if channel in wanted:
-                            yield wanted[channel], content[start:end]
+                    yield channels, content, messages(content, dict(chunk.channels))
 
     def _content(self, source: Source, chunk: _Chunk) -> bytes:
         try:
             return chunk_content(source, chunk.record)
         except Damaged as why:
             raise LogError(self.path, f"changed while it was read ({why})", "Read it again.") from why
-
-    def _decode(self, topic: str, payload: bytes) -> dict[str, Any]:
-        try:
-            return schema.decode(topic, payload)
-        except ValueError as error:
-            raise LogError(self.path, str(error), "Another program wrote it, or wrote into it.") from error
-
-    def _columns(self, topic: str, rows: list[bytes]) -> Columns:
-        fields = schema.CHANNELS[topic].fields
-        columns: Columns = {name: np.empty(len(rows), dtype=np.int64) for name in ("log_ns", "publish_ns")}
-        columns |= {field.name: np.empty(len(rows), dtype=_NUMPY[field.type]) for field in fields}
-        fast = np.zeros(len(rows), dtype=bool)
-        packing = _packing(topic)
-        if packing is not None:
-            fast = packing.unpack(rows, columns)
-        for n in np.flatnonzero(~fast):
-            columns["log_ns"][n], columns["publish_ns"][n] = _TIMES.unpack_from(rows[n])
-            for name, value in self._decode(topic, rows[n][_TIMES.size :]).items():
-                columns[name][n] = value
-        return columns
 
 
 def read_log(path: Path) -> Log:
@@ -169,10 +161,18 @@ def read_log(path: Path) -> Log:
         The file cannot be read, is not a log, or was written with another schema version.
     """
     with Source(path) as source:
-        return _read(source)
+        return _read(source, {})
 
 
-def _read(source: Source) -> Log:
+def read_tables(path: Path, topics: Collection[str]) -> tuple[Log, dict[str, Columns]]:
+    """`read_log` and `Log.tables` in one pass over the file."""
+    tables = _tables(path, topics)
+    with Source(path) as source:
+        log = _read(source, tables)
+    return log, {topic: table.columns() for topic, table in tables.items()}
+
+
+def _read(source: Source, tables: dict[str, _Table]) -> Log:
     scan = Scan(source)
     tally = _Tally(source.path)
     attachments: dict[str, Attachment] = {}
@@ -181,7 +181,12 @@ def _read(source: Source) -> Log:
     for record in scan.records():
         try:
             if record.opcode == Opcode.CHUNK:
-                chunks.append(_Chunk(record, tally.add(scan.chunk(record))))
+                content = scan.chunk(record)
+                channels, found = tally.add(content)
+                chunks.append(_Chunk(record, channels))
+                wanted = {number: channel for number, channel in channels.items() if channel.topic in tables}
+                for topic, mine in _by_topic(wanted, found):
+                    tables[topic].add(content, found, mine)
             elif record.opcode == Opcode.ATTACHMENT:
                 attachment = Attachment(*scan.attachment(record))
                 _check_new(attachments, attachment.name)
@@ -222,36 +227,28 @@ class _Tally:
         self._checked: set[ChannelInfo] = set()
         self._sequence: dict[str, int] = {}
 
-    def add(self, content: bytes) -> dict[int, ChannelInfo]:
-        """Count a chunk; its channels by number. Raises `Damaged`, and then counts nothing of it."""
-        count: dict[int, int] = defaultdict(int)
-        last: dict[int, int] = {}
-        beyond = 2**63
-        first_ns, last_ns = beyond, 0
-        for channel, sequence, log_ns, publish_ns, _, _ in messages(content, self._channels):
-            count[channel] += 1
-            last[channel] = sequence
-            if log_ns < first_ns:
-                first_ns = log_ns
-            if log_ns > last_ns:
-                last_ns = log_ns
-            if publish_ns >= beyond:
-                raise Damaged("a chunk with an impossible time")
-        if last_ns >= beyond:
+    def add(self, content: bytes) -> tuple[dict[int, ChannelInfo], Messages]:
+        """Count a chunk: its channels by number, its messages. Raises `Damaged`, and then counts nothing of it."""
+        found = messages(content, self._channels)
+        if not len(found.channel):
+            return {}, found
+        first_ns, last_ns = int(found.log_ns.min()), int(found.log_ns.max())
+        if max(last_ns, int(found.publish_ns.max())) >= 2**63:
             raise Damaged("a chunk with an impossible time")
-        for channel in count:
-            self._check_schema(self._channels[channel])
-        for channel, n in count.items():
-            topic = self._channels[channel].topic
-            lost = last[channel] - self._sequence.get(topic, 0) - n
+        channels = {number: self._channels[number] for number in np.unique(found.channel).tolist()}
+        for channel in channels.values():
+            self._check_schema(channel)
+        for number, channel in channels.items():
+            sequence = found.sequence[found.channel == number]
+            topic, last = channel.topic, int(sequence[-1])
+            lost = last - self._sequence.get(topic, 0) - len(sequence)
             if lost > 0:
                 self.missing[topic] = self.missing.get(topic, 0) + lost
-            self.counts[topic] = self.counts.get(topic, 0) + n
-            self._sequence[topic] = last[channel]
-        if count:
-            self.start_ns = first_ns if self.start_ns is None else min(self.start_ns, first_ns)
-            self.end_ns = max(self.end_ns, last_ns)
-        return {channel: self._channels[channel] for channel in count}
+            self.counts[topic] = self.counts.get(topic, 0) + len(sequence)
+            self._sequence[topic] = last
+        self.start_ns = first_ns if self.start_ns is None else min(self.start_ns, first_ns)
+        self.end_ns = max(self.end_ns, last_ns)
+        return channels, found
 
     def _check_schema(self, channel: ChannelInfo) -> None:
         if channel in self._checked or channel.topic not in schema.CHANNELS:
@@ -265,6 +262,73 @@ class _Tally:
                 "Read it with the version of dea-rig that wrote it; its metadata names it.",
             )
         self._checked.add(channel)
+
+
+class _Table:
+    """The messages on one topic, gathered chunk by chunk."""
+
+    def __init__(self, path: Path, topic: str) -> None:
+        _check_topic(path, topic)
+        self._path = path
+        self._topic = topic
+        self._packing = _packing(topic)
+        self._blocks: list[NDArray[np.void]] = []
+        self._fits: list[NDArray[np.bool_]] = []  # which rows are in the blocks
+        self._others: list[bytes] = []
+
+    def add(self, content: bytes, found: Messages, mine: NDArray[np.bool_]) -> None:
+        """Take in the messages for which ``mine`` is true."""
+        start, end = found.start[mine] - _TIMES.size, found.end[mine]
+        size = self._packing.layout.itemsize if self._packing else -1
+        fits = end - start == size
+        self._blocks.append(rows(content, start[fits], size) if self._packing else np.empty(0, "V1"))
+        self._fits.append(fits)
+        others = ~fits
+        for a, b in zip(start[others].tolist(), end[others].tolist(), strict=True):
+            self._others.append(content[a:b])
+
+    def columns(self) -> Columns:
+        """The gathered messages by column."""
+        fits = np.concatenate([np.empty(0, dtype=bool), *self._fits])
+        fields = schema.CHANNELS[self._topic].fields
+        columns: Columns = {name: np.empty(len(fits), dtype=np.int64) for name in ("log_ns", "publish_ns")}
+        columns |= {field.name: np.empty(len(fits), dtype=_NUMPY[field.type]) for field in fields}
+        unpacked: list[tuple[int, bytes]] = list(zip(np.flatnonzero(~fits).tolist(), self._others, strict=True))
+        if self._packing and fits.any():
+            data = np.concatenate(self._blocks)
+            sound = self._packing.unpack(data, fits, columns)
+            of_data = np.flatnonzero(~sound)
+            unpacked += zip(np.flatnonzero(fits)[of_data].tolist(), (data[k].tobytes() for k in of_data), strict=True)
+        for n, row in unpacked:
+            columns["log_ns"][n], columns["publish_ns"][n] = _TIMES.unpack_from(row)
+            for name, value in _decode(self._path, self._topic, row[_TIMES.size :]).items():
+                columns[name][n] = value
+        return columns
+
+
+def _tables(path: Path, topics: Collection[str]) -> dict[str, _Table]:
+    return {topic: _Table(path, topic) for topic in topics}
+
+
+def _by_topic(channels: dict[int, ChannelInfo], found: Messages) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Each topic of ``channels``, with which of the messages are on it."""
+    numbers: dict[str, list[int]] = {}
+    for number, channel in channels.items():
+        numbers.setdefault(channel.topic, []).append(number)
+    for topic, of_topic in numbers.items():
+        yield topic, found.channel == of_topic[0] if len(of_topic) == 1 else np.isin(found.channel, of_topic)
+
+
+def _check_topic(path: Path, topic: str) -> None:
+    if topic not in schema.CHANNELS:
+        raise LogError(path, f"no log has a topic {topic}")
+
+
+def _decode(path: Path, topic: str, payload: bytes) -> dict[str, Any]:
+    try:
+        return schema.decode(topic, payload)
+    except ValueError as error:
+        raise LogError(path, str(error), "Another program wrote it, or wrote into it.") from error
 
 
 def _check_new(found: dict[str, Any], name: str) -> None:
@@ -295,23 +359,22 @@ class _Packing(NamedTuple):
     bools: list[str]
     texts: list[str]
 
-    def unpack(self, rows: list[bytes], columns: Columns) -> NDArray[np.bool_]:
-        """Fill the rows of ``columns`` whose bytes lie like this, all at once; which rows those are."""
-        size = self.layout.itemsize
-        fits = np.fromiter((len(row) == size for row in rows), dtype=bool, count=len(rows))
-        data = np.frombuffer(b"".join([row for row in rows if len(row) == size]), dtype=np.uint8).reshape(-1, size)
+    def unpack(self, data: NDArray[np.void], fits: NDArray[np.bool_], columns: Columns) -> NDArray[np.bool_]:
+        """Fill the rows ``fits`` of ``columns`` from ``data``, all at once; which of ``data`` do lie like this."""
+        numbers = data.view(self.layout)
+        octets = data.view(np.uint8).reshape(len(data), -1)
         sound = np.ones(len(data), dtype=bool)
         for offset, value in self.fixed.items():
-            sound &= data[:, offset] == value
-        numbers = data.view(self.layout)[:, 0]
+            sound &= octets[:, offset] == value
         for name in self.bools:
             sound &= numbers[name] <= 1
-        fits[fits] = sound
+        at = fits if sound.all() else np.flatnonzero(fits)[sound]
+        good = numbers if sound.all() else numbers[sound]
         for name in self.layout.names or ():
-            columns[name][fits] = numbers[name][sound]
+            columns[name][at] = good[name]
         for name in self.texts:
-            columns[name][fits] = ""
-        return fits
+            columns[name][at] = ""
+        return sound
 
 
 @cache

@@ -12,14 +12,17 @@ import os
 import re
 import struct
 import zlib
+from array import array
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
+import numpy as np
 import zstandard
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from rig.log.container import MAGIC
 from rig.log.errors import LogError
@@ -36,8 +39,9 @@ EXPANSION = (32 * 1024 * 1024, 32)
 
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")  # first time, last time, size, crc, length of the compression's name
-_MESSAGE = struct.Struct("<BQHIQQ")
-_MESSAGE_START = struct.Struct("<BQH")
+_MESSAGE = np.dtype(
+    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
+)
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
@@ -87,8 +91,15 @@ class ChannelInfo(NamedTuple):
     schema_data: bytes
 
 
-# channel, sequence, log time, publish time, start and end of the payload in the chunk's content
-RawMessage = tuple[int, int, int, int, int, int]
+class Messages(NamedTuple):
+    """The messages of one chunk, in order; arrays of shape (n,)."""
+
+    channel: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    log_ns: NDArray[np.uint64]
+    publish_ns: NDArray[np.uint64]
+    start: NDArray[np.int64]  # of the payload in the chunk's content
+    end: NDArray[np.int64]
 
 
 class Source:
@@ -300,56 +311,73 @@ def _decompressor() -> zstandard.ZstdDecompressor:
     return zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK)
 
 
-def messages(content: bytes, channels: dict[int, ChannelInfo]) -> Iterator[RawMessage]:
-    """The messages of a chunk's content, in order; channels described in it are added to ``channels``.
+def messages(content: bytes, channels: dict[int, ChannelInfo]) -> Messages:
+    """The messages of a chunk's content; channels described in it are added to ``channels``.
 
     Raises `Damaged` when the content is not a sequence of schemas, channels and messages on described channels.
     """
-    offset, size = 0, len(content)
-    unpack, least, described = _MESSAGE.unpack_from, _MESSAGE.size, -1
+    starts = array("q")
     schemas: dict[int, tuple[str, bytes]] = {}
-    while offset < size:
-        if content[offset] == 5 and size - offset >= least:  # Opcode.MESSAGE; this is the inner loop
-            _, length, channel, sequence, log_ns, publish_ns = unpack(content, offset)
-            end = offset + 9 + length
-            if not 22 <= length <= MAX_MESSAGE + 22 or end > size:
-                raise Damaged("a chunk with a message of impossible length")
-            if channel != described:
-                if channel not in channels:
-                    raise Damaged("a chunk with messages of a channel that is nowhere described")
-                described = channel
-            yield channel, sequence, log_ns, publish_ns, offset + least, end
-        else:
-            if size - offset < _HEAD.size:
-                raise Damaged("a chunk that ends in the middle of a record")
-            opcode, length = _HEAD.unpack_from(content, offset)
-            end = offset + 9 + length
-            if end > size or opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
-                raise Damaged("a chunk with a record that does not belong there")
-            body = content[offset + 9 : end]
-            if opcode == Opcode.SCHEMA:
-                number, name, data = _schema(body)
-                schemas[number] = name, data
+    described: set[int] = set()
+    offset, size = 0, len(content)
+    append, unpack = starts.append, _HEAD.unpack_from
+    try:
+        while offset < size:  # only this loop runs once a message
+            opcode, length = unpack(content, offset)
+            if opcode == 5:  # Opcode.MESSAGE
+                append(offset)
             else:
-                number, schema_number, topic, encoding = _channel(body)
-                if schema_number not in schemas:
-                    raise Damaged("a chunk with a channel without schema")
-                channels[number] = ChannelInfo(topic, encoding, *schemas[schema_number])
-                described = -1
-                if len(channels) > MAX_CHANNELS:
-                    raise Damaged(f"more than {MAX_CHANNELS} channels")
-        offset = end
+                body = content[offset + 9 : offset + 9 + length]
+                if len(body) < length:
+                    break
+                _describe(opcode, body, schemas, channels, described)
+            offset += 9 + length
+    except struct.error:
+        offset = -1
+    if offset != size or (starts and starts[-1] + _MESSAGE.itemsize > size):
+        raise Damaged("a chunk that ends in the middle of a record")
+    start = np.frombuffer(starts, dtype=np.int64)
+    head = rows(content, start, _MESSAGE.itemsize).view(_MESSAGE)
+    if not ((head["length"] >= 22) & (head["length"] <= MAX_MESSAGE + 22)).all():
+        raise Damaged("a chunk with a message of impossible length")
+    end = start + 9 + head["length"].astype(np.int64)
+    found = Messages(head["channel"], head["sequence"], head["log"], head["publish"], start + _MESSAGE.itemsize, end)
+    if not set(np.unique(found.channel).tolist()) <= channels.keys():
+        raise Damaged("a chunk with messages of a channel that is nowhere described")
+    return found
 
 
-def spans(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Channel, start and end of the messages of a content that `messages` has accepted, from their log time on."""
-    offset, size, unpack = 0, len(content), _MESSAGE_START.unpack_from
-    while offset < size:
-        opcode, length, channel = unpack(content, offset)
-        end = offset + 9 + length
-        if opcode == 5:  # Opcode.MESSAGE
-            yield channel, offset + 15, end
-        offset = end
+def rows(content: bytes, start: NDArray[np.int64], size: int) -> NDArray[np.void]:
+    """``size`` bytes of ``content`` from each of the offsets ``start``, which must leave room for them."""
+    if not len(start):
+        return np.empty(0, dtype=f"V{size}")
+    return np.ndarray((len(content) - size + 1,), dtype=f"V{size}", buffer=content, strides=(1,))[start]
+
+
+def _describe(
+    opcode: int,
+    body: bytes,
+    schemas: dict[int, tuple[str, bytes]],
+    channels: dict[int, ChannelInfo],
+    described: set[int],
+) -> None:
+    """Take in a schema or a channel of a chunk."""
+    if opcode == Opcode.SCHEMA:
+        number, name, data = _schema(body)
+        schemas[number] = name, data
+    elif opcode == Opcode.CHANNEL:
+        number, schema_number, topic, encoding = _channel(body)
+        if schema_number not in schemas:
+            raise Damaged("a chunk with a channel without schema")
+        channel = ChannelInfo(topic, encoding, *schemas[schema_number])
+        if number in described and channel != channels[number]:
+            raise Damaged("a chunk that describes a channel in two ways")
+        described.add(number)
+        channels[number] = channel
+        if len(channels) > MAX_CHANNELS:
+            raise Damaged(f"more than {MAX_CHANNELS} channels")
+    else:
+        raise Damaged("a chunk with a record that does not belong there")
 
 
 def _shape(opcode: int, length: int, look: bytes) -> bool:
