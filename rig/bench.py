@@ -5,13 +5,13 @@ The same drivers sit on real ports and on the simulated bench in memory; only th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from inspect import signature
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from drivers.link import ByteLink, CanFrame, FrameLink
-from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Stage
+from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Sample, Stage
 from rig.clock import Clock, RealClock, VirtualClock
 from rig.scene import (
     CanTable,
@@ -30,28 +30,29 @@ if TYPE_CHECKING:
 
 
 class Tap(Protocol):
-    """Is told every byte and frame: before it is sent, and as soon as it has been read."""
+    """Is told every byte and frame, before it is sent and as soon as it has been read, with the time of that poll."""
 
-    def __call__(self, role: str, way: Literal["rx", "tx"], data: bytes) -> None: ...
+    def __call__(self, role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None: ...
 
 
 class TappedByteLink:
     """A serial link whose traffic is told to a tap."""
 
-    def __init__(self, role: str, link: ByteLink, tap: Tap) -> None:
+    def __init__(self, role: str, link: ByteLink, tap: Tap, when: Callable[[], float]) -> None:
         self.name = link.name
         self._role = role
         self._link = link
         self._tap = tap
+        self._when = when
 
     def read(self) -> bytes:
         data = self._link.read()
         if data:
-            self._tap(self._role, "rx", data)
+            self._tap(self._role, "rx", data, self._when())
         return data
 
     def write(self, data: bytes) -> None:
-        self._tap(self._role, "tx", data)
+        self._tap(self._role, "tx", data, self._when())
         self._link.write(data)
 
     def close(self) -> None:
@@ -61,20 +62,21 @@ class TappedByteLink:
 class TappedFrameLink:
     """A CAN link whose frames are told to a tap as identifier (two bytes, big-endian) and data."""
 
-    def __init__(self, role: str, link: FrameLink, tap: Tap) -> None:
+    def __init__(self, role: str, link: FrameLink, tap: Tap, when: Callable[[], float]) -> None:
         self.name = link.name
         self._role = role
         self._link = link
         self._tap = tap
+        self._when = when
 
     def read(self) -> list[CanFrame]:
         frames = self._link.read()
         for frame in frames:
-            self._tap(self._role, "rx", frame.id.to_bytes(2, "big") + frame.data)
+            self._tap(self._role, "rx", frame.id.to_bytes(2, "big") + frame.data, self._when())
         return frames
 
     def write(self, frame: CanFrame) -> None:
-        self._tap(self._role, "tx", frame.id.to_bytes(2, "big") + frame.data)
+        self._tap(self._role, "tx", frame.id.to_bytes(2, "big") + frame.data, self._when())
         self._link.write(frame)
 
     def close(self) -> None:
@@ -107,6 +109,7 @@ class Bench:
         self._byte_links: dict[str, ByteLink] = {}
         self._frame_links: dict[str, FrameLink] = {}
         self.devices: dict[str, Device] = {}
+        self._polled_at: float | None = None
         try:
             if scene.on_real_ports:
                 self._open_ports()
@@ -150,8 +153,13 @@ class Bench:
         """Put the drivers on their links; from here on they may be polled."""
         self.displacement = None
         self.hv = None
-        bytes_of: Callable[[str], ByteLink] = lambda role: TappedByteLink(role, self._byte_links[role], tap)  # noqa: E731
-        frames_of: Callable[[str], FrameLink] = lambda role: TappedFrameLink(role, self._frame_links[role], tap)  # noqa: E731
+
+        def bytes_of(role: str) -> ByteLink:
+            return TappedByteLink(role, self._byte_links[role], tap, self._when)
+
+        def frames_of(role: str) -> FrameLink:
+            return TappedFrameLink(role, self._frame_links[role], tap, self._when)
+
         for role, table in self.scene.instruments.items():
             match table:
                 case ZaberTable():
@@ -184,6 +192,21 @@ class Bench:
 
                     self.hv = Shvps(role, bytes_of(role), **arguments(table, Shvps))
                     self.devices[role] = self.hv
+
+    def poll(self, role: str, now: float) -> Sequence[Sample]:
+        """New samples of one instrument.
+
+        Whatever passes on its wire meanwhile is told to the tap with the time ``now``: it is all the time that the
+        driver knows, so that its samples can be worked out again from what the tap was told.
+        """
+        self._polled_at = now
+        try:
+            return self.devices[role].poll(now)
+        finally:
+            self._polled_at = None
+
+    def _when(self) -> float:
+        return self.clock.now() if self._polled_at is None else self._polled_at
 
     def link_settings(self, role: str) -> dict[str, str]:
         """What the link of ``role`` set and what its adapter made of it; nothing for links in memory."""

@@ -131,13 +131,13 @@ class Engine:
     # What actions may do -------------------------------------------------------------------------------------
 
     def command(self, device: str, command: str, argument: str) -> None:
-        """Write a command to the log before it is given."""
+        """Write a command to the log before it is given, its numbers in full: `rig.replay` gives it again."""
         self.recorder.command(device, command, argument)
 
     def move_stage(self, position: float, speed: float) -> None:
         """Move the stage to ``position`` metres of its own scale."""
         self.limits.speed.check(speed, "Stage speed")
-        self.command("stage", "move_to", f"{position * 1e3:.4f} mm at {speed * 1e3:g} mm/s")
+        self.command("stage", "move_to", f"{float(position)!r} m at {speed!r} m/s")
         self.bench.stage.move_to(position, speed)
 
     def move_to(self, h: float, speed: float) -> None:
@@ -299,10 +299,10 @@ class Engine:
         if self._stop.count:
             raise Stopped(f"stopped by {self._stop.source}")
         began = self.clock.now()
-        for role, device in self.bench.devices.items():
+        for role in self.bench.devices:
             # Each device its own time: data must never seem to have come before they were sent.
             now = self.clock.now()
-            for sample in device.poll(now):
+            for sample in self.bench.poll(role, now):
                 self._take(role, sample, now)
         now = self.clock.now()
         if self._watch is not None:

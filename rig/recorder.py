@@ -120,9 +120,9 @@ class Recorder:
                 )
         return sample
 
-    def wire(self, role: str, way: Literal["rx", "tx"], data: bytes) -> None:
-        """Write bytes as they were on the wire."""
-        self._write(f"/raw/{role}/{way}", self._clock.now(), data=data)
+    def wire(self, role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:
+        """Write bytes as they were on the wire; ``t`` is the time that the driver was told."""
+        self._write(f"/raw/{role}/{way}", t, data=data)
 
     def command(self, device: str, command: str, argument: str) -> None:
         """Write a command; called before it is given."""

@@ -99,7 +99,7 @@ class Teardown:
             self._attempt("stage", self._bench.stage.stop)
 
     def _poll(self, role: str) -> None:
-        for sample in self._bench.devices[role].poll(self._bench.clock.now()):
+        for sample in self._bench.poll(role, self._bench.clock.now()):
             added = self._recorder.add(sample)
             if isinstance(added, HVSample) and self._guard is not None:
                 self._guard.on_sample(added)

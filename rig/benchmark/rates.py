@@ -191,7 +191,7 @@ def _drivers(path: Path, seconds: float, progress: Callable[[float], None]) -> R
     counts: dict[str, int] = {}
     with _simulator(path) as (simulator, ports), closing(Bench(_without_hv(scene).with_ports(ports))) as bench:
         clock, devices = bench.clock, bench.devices
-        bench.attach(lambda role, way, data: None)
+        bench.attach(lambda role, way, data, t: None)
         give_up = clock.now() + SETUP_LIMIT_S
         while not all(device.ready for device in devices.values()):
             _turn(bench)

@@ -48,7 +48,10 @@ _T = Field("t_s", "double", "clock time, seconds since the start of the run")
 _FLAGS = Field("flags", "fixed32", f"what is wrong with the sample, a sum of: {_flag_values(SampleFlag)}")
 _RAW = Channel(
     "RawBytes",
-    (_T, Field("data", "bytes", "as on the wire; a CAN frame is its identifier (2 bytes, big-endian) and its data")),
+    (
+        Field("t_s", "double", "clock time of the poll in which they passed, seconds since the start of the run"),
+        Field("data", "bytes", "as on the wire; a CAN frame is its identifier (2 bytes, big-endian) and its data"),
+    ),
 )
 
 CHANNELS: dict[str, Channel] = {

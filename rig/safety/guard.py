@@ -96,8 +96,8 @@ class Guard:
         if faults:
             raise FaultError(f"hv: cannot be armed, the supply reports {flag_names(faults)}. Clear the cause first.")
         limited = self._supply.measures_current
-        limit = f"current limit {self._limits.current.high:g} A" if limited else "no current limit"
-        self._tell("arm", f"ramp {self._ramp:g} V/s, {limit}")
+        limit = f"current limit {self._limits.current.high!r} A" if limited else "no current limit"
+        self._tell("arm", f"ramp {self._ramp!r} V/s, {limit}")
         self.commanded = True
         self._supply.set_ramp(self._ramp)
         if limited:
@@ -137,7 +137,7 @@ class Guard:
             raise FaultError(f"hv: {volts:g} V refused, the guard is latched safe ({self.cause}).")
         self._limits.voltage.check(volts, "HV set-point")
         self._film.check(h, volts, f"HV set-point {volts:g} V at {h * 1e3:.2f} mm")
-        self._tell("set_voltage", f"{volts:g} V")
+        self._tell("set_voltage", f"{volts!r} V")
         self.setpoint = volts
         self._supply.set_voltage(volts)
         if self.state is GuardState.ARMED:
