@@ -7,6 +7,7 @@ when the owner calls ``read`` or ``write``.
 from __future__ import annotations
 
 import contextlib
+from collections import deque
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +19,26 @@ if TYPE_CHECKING:
 
 INTERFACES = ("socketcan", "slcan", "pcan", "vector", "virtual", "udp_multicast")
 
+SHARED = ("socketcan", "udp_multicast")
+"""Interfaces that several programs of one computer may open at once."""
+
 # What an interface needs beyond channel and bit rate. slcan: python-can would sleep 2 s after opening for boards that
-# reset, and wait 1 ms at each look for input. udp_multicast: frames stay on this computer. virtual and udp_multicast
-# have no bit rate; socketcan has its own from the system (ip link set can0 type can bitrate ...).
+# reset, and wait 1 ms at each look for input. vector: channels are counted over all its adapters. udp_multicast: frames
+# stay on this computer. virtual and udp_multicast have no bit rate; socketcan has its own from the system.
 _OPTIONS: dict[str, dict[str, Any]] = {
     "slcan": {"sleep_after_open": 0, "timeout": 0},
+    "vector": {"app_name": None},
     "udp_multicast": {"hop_limit": 0, "fd": False},
 }
 _WITHOUT_BITRATE = {"socketcan", "virtual", "udp_multicast"}
+
+_ADVICE = {
+    "socketcan": "It is Linux only; bring it up first: ip link set can0 up type can bitrate 125000.",
+    "slcan": "The channel is the adapter's serial port; check that nothing else uses it.",
+    "pcan": "Install PEAK's PCAN-Basic driver; channels are named PCAN_USBBUS1 and so on.",
+    "vector": "It needs Windows and Vector's XL driver library; the channel is a number, from 0.",
+    "udp_multicast": "It needs the package msgpack (extra `multicast`), and a multicast address such as 239.74.163.2.",
+}
 
 _BUS_OFF = 0x40  # SocketCAN's error class CAN_ERR_BUSOFF in the identifier of an error frame
 _MOST_LOOKS = 4096  # in one read: some 4 s of a full 125 kbit/s bus
@@ -36,7 +49,8 @@ class CanLink:
     """One CAN interface.
 
     Counters: ``frames_read``, ``frames_written``, ``foreign_frames`` (identifier not in ``accept``, or not a classic
-    11-bit data frame), ``error_frames`` and ``garbage`` (what the interface could not make a frame of).
+    11-bit data frame), ``error_frames``, ``own_echoes`` (what udp_multicast brings back to its sender) and ``garbage``
+    (what the interface could not make a frame of).
 
     Frames on slcan carry no checksum between adapter and host: a corrupted hexadecimal digit is a different frame. What
     is not hexadecimal, or shorter than its length says, is dropped and counted.
@@ -69,9 +83,13 @@ class CanLink:
         **options: Any,
     ) -> None:
         self.name = f"{interface} {channel}"
-        self.counters = dict.fromkeys(("frames_read", "frames_written", "foreign_frames", "error_frames", "garbage"), 0)
+        self.counters = dict.fromkeys(
+            ("frames_read", "frames_written", "foreign_frames", "error_frames", "own_echoes", "garbage"), 0
+        )
         self._where = f"{name} ({self.name})"
         self._accept = None if accept is None else frozenset(accept)
+        self._echoing = interface == "udp_multicast"
+        self._sent: deque[CanFrame] = deque(maxlen=_MOST_LOOKS)  # whose echo has not come yet
         self._lock: PortLock | None = None
         self._bus: can.BusABC | None = self._open(interface, channel, bitrate, options)
 
@@ -96,14 +114,14 @@ class CanLink:
             raise DeviceRefused(
                 self._where,
                 f"the CAN interface cannot be used here ({error})",
-                "It may need a driver or another Python package; see python-can's page on the interface.",
+                _ADVICE.get(interface, ""),
             ) from error
         except (can.CanError, OSError, ValueError, TypeError) as error:
             self._release()
             raise DeviceLost(
                 self._where,
                 f"the CAN channel cannot be opened ({error})",
-                "Check that it exists, that nothing else uses it, and the bit rate; `dea-rig devices` lists channels.",
+                _ADVICE.get(interface, ""),
             ) from error
 
     def read(self) -> list[CanFrame]:
@@ -133,6 +151,8 @@ class CanLink:
         import can
 
         bus = self._open_bus()
+        if self._echoing:
+            self._sent.append(frame)
         try:
             bus.send(
                 can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False, check=True),
@@ -180,7 +200,17 @@ class CanLink:
         if self._accept is not None and message.arbitration_id not in self._accept:
             self.counters["foreign_frames"] += 1
             return None
-        return CanFrame(message.arbitration_id, data)
+        frame = CanFrame(message.arbitration_id, data)
+        return None if self._echoing and self._is_echo(frame) else frame
+
+    def _is_echo(self, frame: CanFrame) -> bool:
+        """Whether a frame is one that was sent from here. Echoes come in order, and before any answer to them."""
+        if frame not in self._sent:
+            return False
+        while self._sent.popleft() != frame:
+            pass  # the echoes of these got lost
+        self.counters["own_echoes"] += 1
+        return True
 
     def _survive(self, bus: can.BusABC, error: Exception) -> None:
         """Go on after garbage; raise `DeviceLost` when the port has vanished.
@@ -189,6 +219,8 @@ class CanLink:
         and fails every later read until the buffer is flushed.
         """
         cause = error.__cause__ or error
+        if self._echoing and cause is not error and not isinstance(cause, OSError):
+            return  # any program may send any datagram to the group
         if isinstance(cause, UnicodeDecodeError):
             with contextlib.suppress(Exception):
                 bus.flush()  # type: ignore[attr-defined]

@@ -8,11 +8,13 @@ simulated bench in another process); a scene in which no instrument has a port r
 from __future__ import annotations
 
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from drivers.can_link import SHARED
 from model.materials import NAMED, Material
 from model.specimen import Specimen
 from rig.errors import ConfigError
@@ -264,15 +266,22 @@ class Scene(Table):
         return self
 
     def _check_buses(self) -> None:
-        on: dict[tuple[str, str], str] = {}
-        for role, table in self.instruments.items():
-            if isinstance(table, CanTable) and table.interface is not None and table.can_channel is not None:
-                other = on.setdefault((table.interface, table.can_channel), role)
-                if other != role:
-                    raise ValueError(
-                        f"{other} and {role} both name the CAN channel {table.can_channel!r}; two instruments on one "
-                        "bus are not supported: give each an adapter of its own"
-                    )
+        buses = {role: table for role, table in self.instruments.items() if isinstance(table, CanTable)}
+        for (one, first), (other, second) in combinations(buses.items(), 2):
+            if first.interface is None or (first.interface, first.can_channel) != (
+                second.interface,
+                second.can_channel,
+            ):
+                continue
+            both = f"{one} and {other} both name the CAN channel {first.can_channel!r}"
+            if first.interface not in SHARED:
+                raise ValueError(
+                    f"{both}, but an adapter of interface {first.interface!r} serves one instrument only, so that "
+                    "nothing stands between the supply and its guard; give each an adapter of its own, or use one that "
+                    'the operating system shares: interface = "socketcan"'
+                )
+            if first.bitrate != second.bitrate:
+                raise ValueError(f"{both}, at {first.bitrate} and {second.bitrate} bit/s; one bus has one bit rate")
 
     def _check_current_limit(self) -> None:
         if self.hv is None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import os
+import random
+import socket
 import subprocess
 import sys
 import threading
@@ -11,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from drivers.can_link import CanLink
+from drivers.can_link import INTERFACES, CanLink
 from drivers.iseg_edcp import IsegEDCP
 from drivers.link import CanFrame, DeviceError, DeviceLost, DeviceRefused, FrameLink
 
@@ -117,9 +119,158 @@ def test_interface_and_channel_that_do_not_exist() -> None:
         CanLink("hv", "socketcan", "can-does-not-exist")
 
 
+CHANNELS = {
+    "socketcan": "can-does-not-exist",
+    "slcan": "/dev/does-not-exist",
+    "pcan": "PCAN_USBBUS1",
+    "vector": "0",
+    "virtual": "test-open",
+    "udp_multicast": "239.74.163.2",
+}
+
+
+@pytest.mark.parametrize("channel", [None, "", "\0", "not a channel", "-1", "99999999999"])
+@pytest.mark.parametrize("interface", INTERFACES)
+def test_every_interface_opens_or_refuses_plainly(interface: str, channel: str | None) -> None:
+    """Whatever drivers this machine has: a link that reads nothing and can be closed, or a message that says why."""
+    try:
+        link = CanLink("hv", interface, CHANNELS[interface] if channel is None else channel)
+    except DeviceError as error:
+        text = str(error)
+        assert text.startswith(f"hv ({interface} ") and "cannot be" in text
+        assert len(error.advice) > 20 and "Traceback" not in text
+        assert interface != "virtual"
+    else:
+        link.read()
+        link.close()
+        with pytest.raises(DeviceLost, match="closed"):
+            link.read()
+
+
+@pytest.mark.parametrize("interface", [i for i in INTERFACES if i != "virtual"])
+def test_a_library_that_fails_in_its_own_way_is_an_error_of_the_family(
+    interface: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for failure in (can.CanInitializationError("no"), OSError(19, "No such device"), ValueError("no"), TypeError("no")):
+
+        def fail(*_: object, failure: Exception = failure, **__: object) -> None:
+            raise failure
+
+        monkeypatch.setattr(can, "Bus", fail)
+        with pytest.raises(DeviceLost, match="cannot be opened"):
+            CanLink("hv", interface, "0")
+
+
+def test_a_controller_that_has_gone_bus_off_is_a_loss_also_without_an_error_frame(
+    pair: tuple[CanLink, can.BusABC], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """pcan and socketcan tell the controller's state; an error frame need not have come."""
+    link, other = pair
+    states = {"now": can.BusState.ACTIVE}
+    monkeypatch.setattr(type(link._bus), "state", property(lambda bus: states["now"]))
+    for state in (can.BusState.ACTIVE, can.BusState.PASSIVE):  # passive: it still takes part
+        states["now"] = state
+        other.send(message(0x200, b"ok"))
+        assert link.read() == [CanFrame(0x200, b"ok")]
+    states["now"] = can.BusState.ERROR
+    with pytest.raises(DeviceLost, match=r"bus-off.*cable, termination and bit rate"):
+        link.read()
+    states["now"] = can.BusState.ACTIVE  # it has recovered
+    other.send(message(0x200, b"ok"))
+    assert link.read() == [CanFrame(0x200, b"ok")]
+
+
+def test_an_interface_that_cannot_tell_its_state_counts_as_well(
+    pair: tuple[CanLink, can.BusABC], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, other = pair
+
+    def unknown(bus: object) -> None:
+        raise NotImplementedError
+
+    monkeypatch.setattr(type(link._bus), "state", property(unknown))
+    other.send(message(0x200, b"ok"))
+    assert link.read() == [CanFrame(0x200, b"ok")]
+
+
 def test_opening_imports_python_can_and_nothing_before_does() -> None:
     code = "import sys, drivers.can_link, drivers.iseg_edcp; assert not {'can', 'serial'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def eventually(look: Callable[[], bool]) -> None:
+    """Wait for the other end, at most a few seconds."""
+    done = threading.Event()
+    for _ in range(3000):
+        if look():
+            return
+        done.wait(1e-3)
+    raise AssertionError("nothing came")
+
+
+def collect(link: CanLink, n: int) -> list[CanFrame]:
+    frames: list[CanFrame] = []
+
+    def look() -> bool:
+        frames.extend(link.read())
+        return len(frames) >= n
+
+    eventually(look)
+    return frames
+
+
+# -- udp_multicast -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def group() -> Iterator[tuple[CanLink, CanLink]]:
+    """Two programs' links in one multicast group of this computer."""
+    links: list[CanLink] = []
+    try:
+        for name in ("host", "module"):
+            links.append(CanLink(name, "udp_multicast", "239.74.163.77"))
+    except DeviceError as error:
+        pytest.skip(f"no multicast on this machine: {error}")
+    yield links[0], links[1]
+    for link in links:
+        link.close()
+
+
+def test_multicast_frames_go_both_ways_and_own_ones_do_not_come_back(group: tuple[CanLink, CanLink]) -> None:
+    host, module = group
+    write, ask = CanFrame(0x200, bytes.fromhex("41000044BB8000")), CanFrame(0x201, bytes.fromhex("410000"))
+    host.write(write)
+    host.write(ask)
+    assert collect(module, 2) == [write, ask]
+    module.write(write)  # a module's answer looks exactly like the host's write
+    assert collect(host, 1) == [write]
+    eventually(lambda: not (host.read() or module.read()) and module.counters["own_echoes"] == 1)
+    assert host.counters["own_echoes"] == 2
+    assert host.counters["foreign_frames"] == host.counters["garbage"] == 0
+
+
+def test_an_echo_that_got_lost_does_not_eat_what_others_send(group: tuple[CanLink, CanLink]) -> None:
+    host, module = group
+    first, second = CanFrame(0x201, b"\x41\x00\x00"), CanFrame(0x201, b"\x41\x02\x00")
+    host._sent.append(first)  # sent, and never come back
+    host.write(second)
+    eventually(lambda: not host.read() and host.counters["own_echoes"] == 1)
+    module.write(first)
+    assert collect(host, 1) == [first]
+
+
+def test_anybody_may_send_anything_to_a_multicast_group(group: tuple[CanLink, CanLink]) -> None:
+    host, module = group
+    rng = random.Random(7)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        for number in range(300):
+            stranger.sendto(rng.randbytes(rng.randrange(1, 40)), ("239.74.163.77", 43113))
+            if number % 50 == 0:
+                host.read()
+    module.write(CanFrame(0x200, b"ok"))
+    assert collect(host, 1) == [CanFrame(0x200, b"ok")]
+    assert host.counters["garbage"] > 200
 
 
 # -- slcan on a pty ----------------------------------------------------------------------------------------------------
@@ -193,27 +344,6 @@ def link(adapter: Adapter) -> Iterator[CanLink]:
     it = CanLink("hv", "slcan", adapter.port, 125_000)
     yield it
     it.close()
-
-
-def eventually(look: Callable[[], bool]) -> None:
-    """Wait for the adapter's thread, at most a few seconds."""
-    done = threading.Event()
-    for _ in range(3000):
-        if look():
-            return
-        done.wait(1e-3)
-    raise AssertionError("nothing came")
-
-
-def collect(link: CanLink, n: int) -> list[CanFrame]:
-    frames: list[CanFrame] = []
-
-    def look() -> bool:
-        frames.extend(link.read())
-        return len(frames) >= n
-
-    eventually(look)
-    return frames
 
 
 def test_slcan_opens_at_the_bit_rate_and_carries_frames(adapter: Adapter, link: CanLink) -> None:
