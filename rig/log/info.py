@@ -38,7 +38,7 @@ def info(path: Path) -> str:
 def _state(log: Log) -> str:
     size = f"{log.path.stat().st_size / 1e6:.1f} MB"
     if log.whole:
-        return f"whole, {size}"
+        return f"whole, {size}" if log.outcome is not None else f"sound, but the run was CUT SHORT, {size}"
     if log.ended:
         return f"DAMAGED, {size}; dea-rig recover copies what is sound"
     return f"CUT SHORT, {size}; dea-rig recover makes it whole"

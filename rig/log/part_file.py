@@ -22,6 +22,7 @@ class PartFile:
         self.part = path.with_name(path.name + ending)
         self._failure: LogError | None = None
         self._size = 0
+        self._synced = 0
         for existing in (self.path, self.part):
             if existing.exists():
                 advice = "Nothing is overwritten: name another file, or move this one away."
@@ -65,6 +66,19 @@ class PartFile:
                 raise failure from error
             raise
         self._size += len(data)
+
+    def sync(self) -> None:
+        """Return when all that was put is on the disk. A disk that does not confirm it closes the file for good."""
+        self.check()
+        if self._synced == self._size:
+            return
+        assert self._fd is not None
+        try:
+            getattr(os, "fdatasync", os.fsync)(self._fd)
+        except OSError as error:
+            self._close()
+            raise self._fail(f"the disk did not confirm what was written ({error.strerror})") from error
+        self._synced = self._size
 
     def finish(self) -> None:
         """Sync the file and give it its name."""

@@ -9,6 +9,7 @@ from rig.log.container import ContainerWriter
 from rig.log.errors import LogError
 from rig.log.part_file import PartFile
 from rig.log.reader import Log, read_log
+from rig.log.text import printable
 
 COMPLETE, NOTHING, PARTIAL = 0, 1, 3
 
@@ -52,7 +53,7 @@ def recover(path: Path, out: Path) -> Recovery:
         if file.is_open:
             file.discard()
         raise
-    return Recovery(COMPLETE if log.whole else PARTIAL, "\n".join(report))
+    return Recovery(COMPLETE if _is_complete(log) else PARTIAL, "\n".join(report))
 
 
 def _copy(log: Log, container: ContainerWriter, report: list[str]) -> None:
@@ -84,13 +85,20 @@ def _copy(log: Log, container: ContainerWriter, report: list[str]) -> None:
     container.finish()
 
 
+def _is_complete(log: Log) -> bool:
+    return log.whole and log.outcome is not None
+
+
 def _report(log: Log) -> list[str]:
     lines = [f"{sum(log.topics.values())} messages on {len(log.topics)} topics recovered."]
     lines += [f"{topic}: {n} messages left out, they are not of this program" for topic, n in log.unknown.items()]
-    if log.whole:
+    if _is_complete(log):
         return [*lines, "Nothing is missing."]
     lines += [f"bytes {gap.start} to {gap.end}: {gap.reason}" for gap in log.gaps]
     lines += [f"{topic}: {count} messages missing" for topic, count in log.missing.items()]
+    if "cut" in log.metadata:
+        reason = printable(log.metadata["cut"].get("reason", "not said why"))
+        lines.append(f"The run was cut short ({reason}): its last 100 ms may not have reached the log.")
     if not log.ended:
         lines.append("The log was cut short: what was recorded after the last message read is not known.")
     if log.outcome is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -10,6 +9,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from rig.log import schema
+from rig.log.checks import Checks
 from rig.log.container import ContainerWriter
 from rig.log.errors import LogError
 from rig.log.part_file import PartFile
@@ -17,11 +17,6 @@ from rig.log.part_file import PartFile
 # A chunk is written when its first message is this old, so that a loop that ticks every 20 ms or faster
 # never has more than 100 ms of samples in memory.
 CHUNK_SECONDS = 0.08
-
-_NAME = re.compile(r"(?!\.)[A-Za-z0-9._-]{1,64}")
-_MAX_ATTACHMENT = 32 * 1024 * 1024
-_MAX_MESSAGE = 64 * 1024
-_MAX_NS = 2**63 - 1
 
 
 class LogWriter:
@@ -50,7 +45,7 @@ class LogWriter:
         self.path = path
         self.kept: Path | None = None
         self._channels: dict[str, int] = {}
-        self._names: set[tuple[str, str]] = set()
+        self._checks = Checks(path)
         self._chunk_since: float | None = None
         self._ended = False
         self._file = PartFile(path)
@@ -80,19 +75,11 @@ class LogWriter:
             The time that it is about (a sample's own time), nanoseconds since 1970.
         """
         self._file.check()
-        if topic not in schema.CHANNELS:
-            raise LogError(self.path, f"there is no topic {topic!r}", f"Topics: {', '.join(schema.CHANNELS)}.")
-        for name, ns in (("log_ns", log_ns), ("publish_ns", publish_ns)):
-            if type(ns) is not int or not 0 <= ns <= _MAX_NS:
-                raise LogError(self.path, f"{name} is {ns!r} on {topic}", "It must be nanoseconds since 1970, an int.")
-        try:
-            data = schema.encode(topic, fields)
-        except ValueError as error:
-            raise LogError(self.path, str(error), "See rig.log.schema.CHANNELS.") from error
-        if len(data) > _MAX_MESSAGE:
-            raise LogError(
-                self.path, f"a message of {len(data)} bytes on {topic}", f"At most {_MAX_MESSAGE} are allowed."
-            )
+        self.add(topic, self._checks.message(topic, fields, log_ns, publish_ns), log_ns, publish_ns)
+
+    def add(self, topic: str, data: bytes, log_ns: int, publish_ns: int) -> None:
+        """`write` of a message that `rig.log.checks.Checks` has encoded."""
+        self._file.check()
         channel = self._channels.get(topic)
         if channel is None:
             channel = self._container.add_channel(topic, schema.schema_name(topic), schema.schema_data(topic))
@@ -110,23 +97,20 @@ class LogWriter:
             self._container.end_chunk()
             self._chunk_since = None
 
+    def sync(self) -> None:
+        """Have the disk confirm what was sent to the file; may take long, so not to be called by who drives a rig."""
+        self._file.sync()
+
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         """Put a file into the log: ``scene.toml``, ``protocol.toml``, a certificate."""
         self._file.check()
-        if len(data) > _MAX_ATTACHMENT:
-            raise LogError(
-                self.path, f"attachment {name} has {len(data)} bytes", f"At most {_MAX_ATTACHMENT} are allowed."
-            )
-        self._check_name("attachment", name)
+        self._checks.attachment(name, data)
         self._container.add_attachment(name, media_type, data)
 
     def metadata(self, name: str, mapping: Mapping[str, str]) -> None:
         """Put a table of strings into the log. Facts about the host belong in the one named ``host``."""
         self._file.check()
-        for text in (part for item in mapping.items() for part in item):
-            if not isinstance(text, str) or any("\ud800" <= letter <= "\udfff" for letter in text):
-                raise LogError(self.path, f"metadata {name}: {text!r} is not text", "Keys and values must be text.")
-        self._check_name("metadata", name)
+        self._checks.metadata(name, mapping)
         self._container.add_metadata(name, mapping)
 
     def finish(self, outcome: Mapping[str, str]) -> None:
@@ -158,10 +142,3 @@ class LogWriter:
             with suppress(LogError):  # what was written before stays readable
                 self._container.finish()
                 self._file.end()
-
-    def _check_name(self, kind: str, name: str) -> None:
-        if not _NAME.fullmatch(name):
-            raise LogError(self.path, f"{kind} name {name!r}", "Allowed: 1 to 64 of A-Z a-z 0-9 . _ -, no leading dot.")
-        if (kind, name) in self._names:
-            raise LogError(self.path, f"{kind} {name!r} is in the log already", "Each name once.")
-        self._names.add((kind, name))

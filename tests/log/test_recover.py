@@ -59,7 +59,7 @@ def test_a_log_that_was_cut_short(small, tmp_path):
     assert recovered.topics == read_log(part).topics
     again = recover(tmp_path / "out.mcap", tmp_path / "again.mcap")
     assert "recovered-again" in read_log(tmp_path / "again.mcap").metadata
-    assert again.exit_code == 0
+    assert again.exit_code == 3  # the end of the run is still missing
 
 
 def test_nothing_to_recover(tmp_path):

@@ -1,0 +1,59 @@
+"""What a producer and the process that writes the log say to each other over a stream socket.
+
+A frame is CRC-32 of the rest (4 bytes, little-endian), length of the body (4), kind (1), body. Bodies are plain bytes
+or JSON; nothing in them can run.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+_HEAD = struct.Struct("<IIB")
+MOST = 48 * 1024 * 1024  # of a body; the largest is an attachment
+
+# From a producer:
+MESSAGE, ATTACHMENT, METADATA, FINISH = range(1, 5)
+# From the writer:
+READY, ALIVE, DONE, FAILED = range(5, 9)
+
+MESSAGE_HEAD = struct.Struct("<BQQ")  # index of the topic in rig.log.schema.CHANNELS, log time, publish time
+FREE = struct.Struct("<Q")  # in ALIVE: bytes free on the disk
+
+
+def pack(kind: int, body: bytes) -> bytes:
+    """One frame."""
+    return _HEAD.pack(zlib.crc32(body, kind), len(body), kind) + body
+
+
+class Unpacker:
+    """Cuts a stream into frames."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[tuple[int, bytes]]:
+        """Kind and body of the frames that are complete with ``data``.
+
+        Raises
+        ------
+        ValueError
+            What came is not a frame; nothing after it can be understood.
+        """
+        self._buffer += data
+        found = []
+        at, size = 0, len(self._buffer)
+        while size - at >= _HEAD.size:
+            crc, length, kind = _HEAD.unpack_from(self._buffer, at)
+            if length > MOST:
+                raise ValueError(f"a frame of {length} bytes")
+            if size - at - _HEAD.size < length:
+                break
+            at += _HEAD.size
+            body = bytes(self._buffer[at : at + length])
+            if zlib.crc32(body, kind) != crc:
+                raise ValueError("a frame whose checksum does not match")
+            found.append((kind, body))
+            at += length
+        del self._buffer[:at]
+        return found

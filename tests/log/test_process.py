@@ -1,0 +1,203 @@
+"""The writer in a process of its own: same log as in one process, and what happens when one of the two fails."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rig.log.errors import LogError
+from rig.log.process import LogProcess
+from rig.log.reader import read_log
+from rig.log.recover import recover
+from rig.log.remote import MOST_WAITING, SILENCE_S, RemoteLog
+from rig.log.writer import LogWriter
+
+
+def record(log, n=50, start=0):
+    for k in range(start, start + n):
+        log.write("/force/sample", {"t_s": k * 1e-3, "reading": 0.1 * k, "force_N": -k, "flags": 0}, k * 10**6, k)
+        log.tick(k * 1e-3)
+
+
+def until(condition, seconds=30.0):
+    """Wait for something that another process does."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_the_same_log_as_in_one_process(tmp_path):
+    for path, kind in ((tmp_path / "a.mcap", LogWriter), (tmp_path / "b.mcap", LogProcess)):
+        with kind(path) as log:
+            log.attach("scene.toml", "application/toml", bytes(3_000_000))  # more than a socket holds
+            log.metadata("run", {"scene": "é"})
+            record(log)
+            assert not path.exists() and log.part.exists()
+            log.finish({"status": "complete"})
+        assert path.exists() and not log.part.exists() and log.kept is None
+    a, b = read_log(tmp_path / "a.mcap"), read_log(tmp_path / "b.mcap")
+    assert b.whole
+    assert (a.metadata, a.attachments, a.topics) == (b.metadata, b.attachments, b.topics)
+    assert list(a.messages("/force/sample")) == list(b.messages("/force/sample"))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda log: log.write("/force/sampel", {}, 0, 0),
+        lambda log: log.write("/force/sample", {"t_s": 0.0}, 0, 0),
+        lambda log: log.write("/event", {"t_s": 0.0, "severity": "", "source": "", "message": ""}, -1, 0),
+        lambda log: log.attach("../../etc/passwd", "text/plain", b""),
+        lambda log: log.metadata("log", {}),
+        lambda log: log.metadata("run", {"n": 3}),
+        lambda log: log.finish({"duration": 3.0}),
+    ],
+)
+def test_bad_input_is_refused_here_and_reaches_no_file(tmp_path, call):
+    with LogProcess(tmp_path / "a.mcap") as log:
+        record(log)
+        with pytest.raises(LogError):
+            call(log)
+        record(log, start=50)
+        log.finish({})
+    assert read_log(tmp_path / "a.mcap").whole
+    assert read_log(tmp_path / "a.mcap").topics == {"/force/sample": 100}
+
+
+@pytest.mark.parametrize("existing", ["a.mcap", "a.mcap.part"])
+def test_nothing_is_overwritten(tmp_path, existing):
+    (tmp_path / existing).write_text("precious")
+    with pytest.raises(LogError, match=f"{existing}: exists already"):
+        LogProcess(tmp_path / "a.mcap")
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {existing: "precious"}
+
+
+def test_an_exception_keeps_what_was_recorded(tmp_path):
+    path = tmp_path / "a.mcap"
+    with pytest.raises(RuntimeError) as caught, LogProcess(path) as log:
+        record(log)
+        raise RuntimeError("the stage is on fire")
+    assert log.kept == log.part
+    assert caught.value.__notes__ == [f"What was recorded is kept in {log.part}."]
+    kept = read_log(log.part)
+    assert kept.topics == {"/force/sample": 50}
+    assert kept.ended and kept.outcome is None and "cut" in kept.metadata
+    recovery = recover(log.part, tmp_path / "b.mcap")
+    assert recovery.exit_code == 3
+    assert "ended without finishing" in recovery.report
+
+
+def test_a_log_without_messages_leaves_no_file(tmp_path):
+    with pytest.raises(RuntimeError), LogProcess(tmp_path / "a.mcap") as log:
+        log.attach("scene.toml", "application/toml", b"x")
+        raise RuntimeError("no such port")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_signals_are_not_for_the_writer(tmp_path):
+    with LogProcess(tmp_path / "a.mcap") as log:
+        record(log)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+            os.kill(log.pid, number)
+        record(log, start=50)
+        log.finish({})
+    assert read_log(tmp_path / "a.mcap").topics == {"/force/sample": 100}
+
+
+def test_a_writer_that_dies_is_an_error_at_the_next_turn(tmp_path):
+    with pytest.raises(LogError, match="has ended") as caught, LogProcess(tmp_path / "a.mcap") as log:
+        record(log)
+        until(lambda: read_log(log.part).topics)
+        os.kill(log.pid, signal.SIGKILL)
+        log._process.wait()
+        with pytest.raises(LogError, match=r"recover .*a\.mcap\.part"):
+            record(log, 1)
+        record(log, 1)  # and so is every later call
+    assert str(log.part) in caught.value.__notes__[0]
+    assert read_log(log.part).topics["/force/sample"] > 0
+
+
+def test_a_writer_that_hangs_blocks_nobody(tmp_path):
+    path = tmp_path / "a.mcap"
+    with pytest.raises(LogError, match="not answered"), LogProcess(path) as log:
+        record(log)
+        os.kill(log.pid, signal.SIGSTOP)
+        try:
+            record(log, 100, start=50)  # the first turns: what was said before may still come in
+            log.tick(0.15)
+            log.tick(0.15 + SILENCE_S)
+        finally:
+            os.kill(log.pid, signal.SIGCONT)
+    # it went on, and saved what had been sent
+    until(lambda: read_log(log.part).ended)
+    assert read_log(log.part).topics == {"/force/sample": 150}
+
+
+def test_what_waits_for_a_hanging_writer_is_bounded(tmp_path):
+    data = {"t_s": 0.0, "data": bytes(60_000)}
+    with pytest.raises(LogError, match="does not keep up"), LogProcess(tmp_path / "a.mcap") as log:
+        os.kill(log.pid, signal.SIGSTOP)
+        try:
+            for k in range(MOST_WAITING // 60_000 + 100):
+                log.write("/raw/force/rx", data, k, k)
+        finally:
+            os.kill(log.pid, signal.SIGCONT)
+
+
+SECOND = """
+import socket, sys, time
+from pathlib import Path
+from rig.log.remote import RemoteLog
+
+log = RemoteLog(Path("a.mcap"), socket.socket(fileno=int(sys.argv[1])))
+print("ready", flush=True)
+sys.stdin.readline()  # until the first producer is dead
+for k in range(100):
+    log.write("/command", {"t_s": 1.0 + k, "device": "hv", "command": "off", "argument": ""}, 10**9 + k, 10**9 + k)
+    log.tick(k * 1e-3)
+log.close()
+"""
+
+FIRST = """
+import os, signal, subprocess, sys
+from pathlib import Path
+from rig.log.process import LogProcess
+
+log = LogProcess(Path(sys.argv[1]))
+end = log.second.fileno()
+second = subprocess.Popen([sys.executable, "-c", sys.argv[2], str(end)], pass_fds=[end], stdout=subprocess.PIPE)
+log.second.close()
+second.stdout.readline()
+for k in range(50):
+    log.write("/force/sample", {"t_s": k * 1e-3, "reading": 0.1 * k, "force_N": -k, "flags": 0}, k, k)
+log.tick(0.0)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_second_producer_records_on_after_the_death_of_the_first(tmp_path):
+    path = tmp_path / "a.mcap"
+    with subprocess.Popen([sys.executable, "-c", FIRST, path, SECOND], stdin=subprocess.PIPE) as first:
+        first.wait(60)
+        part = tmp_path / "a.mcap.part"
+        until(lambda: read_log(part).topics == {"/force/sample": 50})
+        assert not read_log(part).ended  # the writer is still there for the other one
+        first.stdin.write(b"\n")
+    until(lambda: read_log(part).ended)
+    assert read_log(part).topics == {"/force/sample": 50, "/command": 100}
+    assert "cut" in read_log(part).metadata
+
+
+def test_finish_waits_for_the_second_producer(tmp_path):
+    with LogProcess(tmp_path / "a.mcap") as log:
+        second = RemoteLog(log.path, socket.socket(fileno=os.dup(log.second.fileno())))
+        record(log)
+        record(second, start=50)
+        second.close()
+        log.finish({})
+    assert read_log(tmp_path / "a.mcap").topics == {"/force/sample": 100}
