@@ -24,6 +24,8 @@ UNCERTAINTIES = (
     "thickness_uncertainty",
     "prestretch_uncertainty",
     "disk_radius_uncertainty",
+    "compliance_uncertainty",
+    "eccentricity",
 )
 
 
@@ -63,6 +65,11 @@ class Curve:
     thickness_uncertainty, prestretch_uncertainty, disk_radius_uncertainty : float
         Relative standard uncertainties of the specimen's own dimensions; taken as the same error in all curves of a
         fit (films of one batch, one punch), which is the cautious choice.
+    compliance_uncertainty : float
+        Standard uncertainty of the rig's compliance (m/N) where ``h`` is the stage's way, already corrected by the
+        compliance that is believed; 0 where a sensor on the disk measures ``h``. One rig: the same in all curves.
+    eccentricity : float
+        Standard uncertainty of the distance of the disk's centre from the ring's (m).
     flagged : ndarray of bool, shape (n,), optional
         Samples that an instrument itself called bad.
     """
@@ -85,6 +92,8 @@ class Curve:
     thickness_uncertainty: float = 0.0
     prestretch_uncertainty: float = 0.0
     disk_radius_uncertainty: float = 0.0
+    compliance_uncertainty: float = 0.0
+    eccentricity: float = 0.0
     flagged: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:

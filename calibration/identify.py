@@ -24,13 +24,14 @@ from scipy.special import gammaincc
 
 from calibration.curve import Curve
 from calibration.identifiability import advice
-from calibration.problem import TOLERANCE, IdentificationError, Problem
+from calibration.problem import NODES, TOLERANCE, IdentificationError, Problem
 from calibration.profile import intervals, targets, widened
 from calibration.propagation import secant_modulus, state
-from calibration.reduction import interpolation_matrix, select
+from calibration.reduction import Selection, interpolation_matrix, select
 from calibration.result import IDENTIFIED, CurveResult, Identification, verdict
+from calibration.search import minimise_many
 from model.materials import Material
-from model.membrane import solve_many
+from model.membrane import Wrinkling, solve_many
 
 Array = NDArray[np.float64]
 
@@ -42,7 +43,10 @@ SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
 SHARE_BOUNDS = (1e-6, 100.0)
 EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
 PERMITTIVITY_BOUNDS = (0.5, 200.0)
-SEARCH, FINAL = (1e-5, 40), (1e-6, 100)  # relative decrease of chi-square and evaluations that end a fit
+FINAL, MOST_STEPS = 1e-5, 60  # relative decrease of chi-square that ends the last fit, and its evaluations
+MOST_NODES = 36
+SEARCH_TOLERANCE = 1e-6  # of the membrane's force, relative, while the minima are sought
+INTERPOLATION = 0.1  # largest estimated error of interpolation, in standard deviations of what a node carries
 AT_BOUND = 1e-4  # distance to a bound, relative to the distance of the bounds
 SAME_MINIMUM = 0.5  # chi-square by which two minima may differ and count as one
 
@@ -56,6 +60,8 @@ def identify(
     negative_exponents: bool = False,
     profiles: bool = False,
     fixed: Mapping[str, float] | None = None,
+    wrinkling: Wrinkling = "plain",
+    near: Sequence[Material] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> Identification:
     """Fit an Ogden film to force-displacement curves.
@@ -75,6 +81,11 @@ def identify(
         as long, and widens the uncertainties where the problem is too far from linear for its curvature to tell.
     fixed : mapping of str to float, optional
         ``alpha1``... and ``eps_r`` that are known and not to be fitted, e.g. ``{"eps_r": 1.7}``.
+    wrinkling : {"plain", "tension_field"}
+        What becomes of samples at which the film is wrinkled: left out, or described by the tension field. They are
+        counted either way.
+    near : sequence of Material
+        Further starting points, of at most as many terms.
     provenance : mapping, optional
         Whatever identifies the data (hashes of logs, names of files), as plain JSON values; kept in the result.
 
@@ -96,70 +107,111 @@ def identify(
     guess = curves[0].specimen.material
     if "eps_r" in held:
         guess = replace(guess, eps_r=held["eps_r"])
-    material = _scaled(guess, curves)
-    selections = select(curves, material)
+    (material,) = _scaled([guess], curves)
+    selections = select(curves, material, wrinkling)
     notes: list[str] = []
-    fits: list[_Fit] = []
+    nodes = NODES
     for number in range(PASSES):
-        problem = Problem(curves, selections, terms, material)
-        if not fits:
-            guesses = _starting_materials(material, terms, starts, seed, held, negative_exponents)
-            points = [problem.vector(_scaled(start, curves)) for start in guesses]
-            fits = sorted(
-                (fit for fit in (_minimise(problem, x, held, SEARCH) for x in points) if fit is not None),
-                key=lambda fit: fit.cost,
-            )
-            if not fits:
-                raise IdentificationError("no fit converged from any starting point; is the specimen's geometry right?")
+        if number == 0:
+            search = Problem(curves, selections, terms, material, tolerance=SEARCH_TOLERANCE, wrinkling=wrinkling)
+            points = _starting_materials(material, terms, starts, seed, held, negative_exponents)
+            points += [_spread(one, terms) for one in near]
+            fits = _search(search, _scaled(points, curves), held)
             best = _representative(fits)
-        else:
-            again = _minimise(problem, best.restarted(problem), held, FINAL)
-            best = best if again is None else again
+            material = search.film(best.x)
+        problem = Problem(curves, selections, terms, material, nodes=nodes, wrinkling=wrinkling)
+        again = _minimise(problem, best.restarted(problem), held)
+        best = best if again is None else again
         material = problem.film(best.x)
-        previous, selections = selections, select(curves, material)
-        # The first pass took its weights and its corrections for voltage from the guess: always make a second one.
-        if number > 0 and all(np.array_equal(a.used, b.used) for a, b in zip(previous, selections, strict=True)):
+        previous, selections = selections, select(curves, material, wrinkling)
+        if nodes < MOST_NODES and _too_coarse(problem, best.x):
+            nodes = min(MOST_NODES, nodes * 3 // 2)
+        elif number > 0 and _same(previous, selections):
+            # The first pass took its weights and corrections from the search: always make a second one.
             break
     else:
         notes.append("the set of samples at which the film is taut did not settle while fitting")
     notes += _other_minima(fits)
     record = {
         "data": dict(provenance or {}),
-        "settings": {"terms": terms, "starts": starts, "seed": seed, "fixed": held},
+        "settings": {"terms": terms, "starts": starts, "seed": seed, "fixed": held, "wrinkling": wrinkling},
         "software": {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")},
     }
     return _assemble(best, fits, held, notes, record, profiles=profiles)
 
 
+def _too_coarse(problem: Problem, x: Array) -> bool:
+    """Whether the interpolation of some curve is off by a tenth of the standard error of what a node carries."""
+    most = max(block.samples for block in problem.blocks) / problem.nodes.shape[1]
+    noise = np.array([problem.curves[i].force_noise for i in problem.active]) / math.sqrt(max(1.0, most))
+    return bool((problem.interpolation_error(problem.states(x)) > INTERPOLATION * noise).any())
+
+
+def _same(before: Sequence[Selection], after: Sequence[Selection]) -> bool:
+    """Whether two selections hold the same samples in the same parts."""
+    return all(
+        len(a.parts) == len(b.parts)
+        and all(np.array_equal(one.used, other.used) for one, other in zip(a.parts, b.parts, strict=True))
+        for a, b in zip(before, after, strict=True)
+    )
+
+
 def compare(curves: Sequence[Curve], *, terms: Sequence[int] = (1, 2, 3), **options: Any) -> list[Identification]:
-    """`identify` with each number of Ogden terms, to be compared by ``aicc`` and ``bic``; ``options`` as there."""
-    return [identify(curves, terms=count, **options) for count in terms]
+    """`identify` with each number of Ogden terms, to be compared by ``aicc`` and ``bic``; ``options`` as there.
+
+    Each starts from what fewer terms found, too: more terms never fit worse.
+    """
+    found: list[Identification] = []
+    for count in terms:
+        fewer = [one.material for one in found if one.terms < count]
+        found.append(identify(curves, terms=count, near=fewer[-1:], **options))
+    return found
 
 
 # --- starting points and minimisation
 
 
-def _scaled(material: Material, curves: Sequence[Curve]) -> Material:
-    """``material`` made as stiff as the curves with the least voltage say it is."""
+def _scaled(materials: Sequence[Material], curves: Sequence[Curve]) -> list[Material]:
+    """The materials made as stiff as the curves with the least voltage say they are."""
     least = min(abs(curve.nominal_voltage) for curve in curves)
-    measured_by_model = model_squared = 0.0
-    for curve in curves:
-        rows = curve.usable & (curve.h > 0.0)
-        if abs(curve.nominal_voltage) > least or not rows.any():
-            continue
-        grid = np.linspace(0.0, float(curve.h[rows].max()), 9)
-        force = solve_many(curve.specimen.with_material(material), grid).force
-        known = np.isfinite(force)
-        model = np.interp(curve.h[rows], grid[known], force[known])
-        measured_by_model += float(curve.force[rows] @ model)
-        model_squared += float(model @ model)
-    if not measured_by_model > 0.0:
-        raise IdentificationError(
-            "the force does not rise with the displacement in the curves with the least voltage: "
-            "is the sign of the force or of the displacement right, and is there a film?"
-        )
-    ratio = measured_by_model / model_squared
-    return replace(material, mu=tuple(mu * ratio for mu in material.mu))
+    rows = [curve.usable & (curve.h > 0.0) for curve in curves]
+    plain = [
+        (curve, used)
+        for curve, used in zip(curves, rows, strict=True)
+        if abs(curve.nominal_voltage) == least and used.any()
+    ]
+    specimens = np.empty((len(materials), len(plain), 1), dtype=np.object_)
+    for s, material in enumerate(materials):
+        specimens[s, :, 0] = [curve.specimen.with_material(material) for curve, _ in plain]
+    grid = np.array([np.linspace(0.0, float(curve.h[used].max()), 9) for curve, used in plain]).reshape(-1, 9)
+    solved = solve_many(specimens, grid, tolerance=1e-5).force
+    scaled = []
+    for material, forces in zip(materials, solved, strict=True):
+        measured_by_model = model_squared = 0.0
+        for (curve, used), places, force in zip(plain, grid, forces, strict=True):
+            known = np.isfinite(force)
+            model = np.interp(curve.h[used], places[known], force[known])
+            measured_by_model += float(curve.force[used] @ model)
+            model_squared += float(model @ model)
+        if not measured_by_model > 0.0:
+            raise IdentificationError(
+                "the force does not rise with the displacement in the curves with the least voltage: "
+                "is the sign of the force or of the displacement right, and is there a film?"
+            )
+        ratio = measured_by_model / model_squared
+        scaled.append(replace(material, mu=tuple(mu * ratio for mu in material.mu)))
+    return scaled
+
+
+def _spread(material: Material, terms: int) -> Material:
+    """The same film with more terms: its last one, cut in pieces with exponents around its own."""
+    mu, alpha = list(material.mu), list(material.alpha)
+    pieces = terms - len(mu) + 1
+    share = mu.pop() * alpha[-1] / pieces
+    last = alpha.pop()
+    exponents = last * np.linspace(0.8, 1.2, pieces) if pieces > 1 else np.array([last])
+    mu += [float(share / exponent) for exponent in exponents]
+    return replace(material, mu=tuple(mu), alpha=(*alpha, *map(float, exponents)))
 
 
 def _starting_materials(
@@ -192,32 +244,76 @@ class _Fit:
     x: Array
     cost: float
     converged: bool
-    evaluations: int
     varied: NDArray[np.bool_]
     at_bound: NDArray[np.bool_]
 
     def restarted(self, problem: Problem) -> Array:
-        """This minimum as a starting point of ``problem``, whose scale and set of zeros may differ."""
+        """This minimum as a starting point of ``problem``, whose scale and set of nuisances may differ."""
         x = problem.vector(self.problem.film(self.x))
         found = self.x[self.problem.film_parameters :]
-        zeros = {zero[:2]: value for zero, value in zip(self.problem.zeros, found, strict=True)}
-        x[problem.film_parameters :] = [zeros.get(zero[:2], 0.0) for zero in problem.zeros]
+        known = {(one.kind, one.run): value for one, value in zip(self.problem.nuisances, found, strict=True)}
+        x[problem.film_parameters :] = [known.get((one.kind, one.run), 0.0) for one in problem.nuisances]
         return x
 
 
-def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort: tuple[float, int]) -> _Fit | None:
-    """Least squares from one starting point; None where the model has no answer there."""
+def _search(problem: Problem, materials: Sequence[Material], held: Mapping[str, float]) -> list[_Fit]:
+    """Minima from all starting materials, best first."""
+    n = problem.terms
+    varied = np.array([name not in held for name in problem.names])
+    points = np.array([problem.vector(material) for material in materials])
+    low, high = (np.array(side) for side in zip(*(_bounds(problem, x) for x in points), strict=True))
+    points = np.where(varied, np.clip(points, low, high), points)
+    if problem.electric and "eps_r" not in held:
+        for _ in range(8):
+            lost = ~problem.evaluate(points, slopes=False).answered & (points[:, 2 * n] > 1.0)
+            if not lost.any():
+                break
+            points[lost, 2 * n] *= 0.5  # a film this soft cannot hold the voltage with that permittivity
+    found = minimise_many(problem, points, (low, high), varied)
+    fits = [
+        _fit(problem, one.x, one.cost, one.converged, (low[k], high[k]), varied, held)
+        for k, one in enumerate(found)
+        if one is not None
+    ]
+    if not fits:
+        raise IdentificationError("no fit converged from any starting point; is the specimen's geometry right?")
+    return sorted(fits, key=lambda fit: fit.cost)
+
+
+def _fit(
+    problem: Problem,
+    x: Array,
+    cost: float,
+    converged: bool,
+    bounds: tuple[Array, Array],
+    varied: NDArray[np.bool_],
+    held: Mapping[str, float],
+) -> _Fit:
+    """A minimum with its terms sorted by exponent."""
+    n = problem.terms
+    low, high = bounds
+    span = high - low
+    at_bound = varied & (np.minimum(x - low, high - x) < AT_BOUND * span) & np.isfinite(span)
+    if not any(name.startswith("alpha") for name in held):
+        order = np.argsort(x[n : 2 * n])
+        order = np.concatenate((order, n + order, np.arange(2 * n, x.size)))
+        x, at_bound = x[order], at_bound[order]
+    return _Fit(problem, x, cost, converged, varied, at_bound)
+
+
+def _minimise(problem: Problem, start: Array, held: Mapping[str, float]) -> _Fit | None:
+    """Least squares by lmfit from near the minimum; None where the model has no answer there."""
     import lmfit
 
-    n = problem.terms
     lower, upper = _bounds(problem, start)
     varied = np.array([name not in held for name in problem.names])
     margin = np.where(np.isfinite(upper - lower), 1e-3 * (upper - lower), 0.0)
-    start = np.where(varied, np.clip(start, lower + np.minimum(margin, 1e-3), upper - margin), start)
-    while problem.electric and "eps_r" not in held and not problem.answers(start) and start[2 * n] > 1.0:
-        start[2 * n] *= 0.7  # a film this soft cannot hold the voltage with that permittivity
-    if not problem.answers(start):
+    inside = np.clip(start, lower + np.minimum(margin, 1e-6), upper - np.minimum(margin, 1e-6))
+    start = np.where(varied, inside, start)
+    (near,) = minimise_many(problem, start[None], (lower[None], upper[None]), varied, decrease=1e-3)
+    if near is None:
         return None
+    start = near.x
 
     parameters = lmfit.Parameters()
     for name, value, low, high, vary in zip(problem.names, start, lower, upper, varied, strict=True):
@@ -232,7 +328,6 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort:
     def jacobian(values: Any) -> Array:
         return problem.jacobian(vector(values))[:, varied]
 
-    tolerance, budget = effort
     # scale_covar off: the weights come from calibration, and a misfit must show as one.
     minimiser = lmfit.Minimizer(residual, parameters, scale_covar=False, nan_policy="raise")
     with python_warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -240,19 +335,13 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float], effort:
         # identifiable. Ours (`calibration.propagation.Covariance`) is used instead.
         python_warnings.simplefilter("ignore")
         out = minimiser.minimize(
-            method="least_squares", jac=jacobian, x_scale="jac", ftol=tolerance, xtol=1e-9, gtol=1e-9, max_nfev=budget
+            method="least_squares", jac=jacobian, x_scale="jac", ftol=FINAL, xtol=1e-9, gtol=1e-9, max_nfev=MOST_STEPS
         )
     x = vector(out.params)
     if not problem.answers(x):
         return None
     final = problem.residual(x)
-    span = np.where(np.isfinite(upper - lower), upper - lower, np.inf)
-    at_bound = varied & (np.minimum(x - lower, upper - x) < AT_BOUND * span) & np.isfinite(span)
-    if not any(name.startswith("alpha") for name in held):
-        order = np.argsort(x[n : 2 * n])
-        order = np.concatenate((order, n + order, np.arange(2 * n, x.size)))
-        x, at_bound = x[order], at_bound[order]
-    return _Fit(problem, x, float(final @ final), bool(out.success), int(out.nfev), varied, at_bound)
+    return _fit(problem, x, float(final @ final), bool(out.success), (lower, upper), varied, held)
 
 
 def _bounds(problem: Problem, x: Array) -> tuple[Array, Array]:
@@ -365,22 +454,26 @@ def _assemble(
 
 def _curve_results(problem: Problem, x: Array) -> list[CurveResult]:
     states = problem.states(x)
-    film = problem.film(x)
+    errors = _interpolation_errors(problem, problem.film(x))
     results = []
     for i, (curve, selection) in enumerate(zip(problem.curves, problem.selections, strict=True)):
         rms = expected = lag1 = error = math.nan
         loading: float | None = None
         unloading: float | None = None
-        if i in problem.active:
-            row = problem.active.index(i)
-            residual, sigma, _ = problem.samples(row, x, states)
+        rows = [row for row, active in enumerate(problem.active) if active == i]
+        if rows:
+            residual, sigma = np.zeros(curve.h.size), np.zeros(curve.h.size)
+            for row in rows:
+                used = problem.parts[row][1].used
+                residual[used], sigma[used], _ = problem.samples(row, x, states)
+            residual, sigma = residual[selection.used], sigma[selection.used]
             direction = curve.direction[selection.used]
             rms, expected = float(np.sqrt(np.mean(residual**2))), float(np.sqrt(np.mean(sigma**2)))
             lag1 = float(residual[1:] @ residual[:-1] / (residual @ residual)) if residual.size > 1 else math.nan
             loading, unloading = (
                 float(residual[direction == way].mean()) if (direction == way).any() else None for way in (1, -1)
             )
-            error = _interpolation_error(problem, row, film)
+            error = float(errors[rows].max())
         results.append(
             CurveResult(
                 label=curve.label,
@@ -401,22 +494,29 @@ def _curve_results(problem: Problem, x: Array) -> list[CurveResult]:
     return results
 
 
-def _interpolation_error(problem: Problem, row: int, film: Material) -> float:
-    """Largest difference (N) between the interpolant of a curve and the model, midway between its nodes."""
-    nodes = problem.nodes[row]
-    specimen = problem.curves[problem.active[row]].specimen.with_material(film)
-    between = 0.5 * (nodes[1:] + nodes[:-1])
-    ends = np.array([problem.selections[problem.active[row]].low, problem.selections[problem.active[row]].high])
-    points = np.concatenate((ends, between))
-    at_nodes = solve_many(specimen, nodes, problem.voltage[row], tolerance=TOLERANCE).force
-    direct = solve_many(specimen, points, problem.voltage[row], tolerance=TOLERANCE).force
-    return float(np.abs(interpolation_matrix(nodes, points) @ at_nodes - direct).max())
+def _interpolation_errors(problem: Problem, film: Material) -> Array:
+    """Largest difference (N) between the interpolant of each row and the model, at its ends and between its nodes."""
+    ends = np.array([[part.low, part.high] for _, part in problem.parts])
+    between = 0.5 * (problem.nodes[:, 1:] + problem.nodes[:, :-1])
+    points = np.concatenate((problem.nodes, ends, between), axis=1)
+    specimens = np.empty((len(points), 1), dtype=np.object_)
+    specimens[:, 0] = [problem.curves[i].specimen.with_material(film) for i in problem.active]
+    force = solve_many(
+        specimens, points, problem.voltage[:, None], tolerance=TOLERANCE, wrinkling=problem.wrinkling
+    ).force
+    count = problem.nodes.shape[1]
+    return np.array(
+        [
+            np.abs(interpolation_matrix(nodes, at[count:]) @ values[:count] - values[count:]).max()
+            for nodes, at, values in zip(problem.nodes, points, force, strict=True)
+        ]
+    )
 
 
 def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
     words = []
     if not fit.converged:
-        words.append(f"the fit did not converge in {fit.evaluations} evaluations; its numbers are provisional")
+        words.append(f"the fit did not converge in {MOST_STEPS} evaluations; its numbers are provisional")
     edge = [name for name, quantity in result.quantities.items() if quantity.at_bound]
     if edge:
         words.append(f"{', '.join(edge)} ended at the edge of the allowed range: not determined by this data")

@@ -22,12 +22,13 @@ from calibration.reduction import (
     reference_voltage,
 )
 from model.materials import Material
-from model.membrane import solve_many
+from model.membrane import Wrinkling, solve_many
+from model.specimen import Specimen
 
 Array = NDArray[np.float64]
 
-NODES = 12
-TOLERANCE = 1e-8  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
+NODES = 8  # of every part of a curve, to begin with
+TOLERANCE = 1e-7  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
 INVALID_RESIDUAL = 1e8  # where the membrane has no state; larger than any real residual
 
 
@@ -35,11 +36,41 @@ class IdentificationError(ValueError):
     """Curves from which nothing can be identified; the message says why."""
 
 
+@dataclass(frozen=True)
+class Nuisance:
+    """An error of the rig that is fitted along: what kind, of which run, its prior standard uncertainty, which rows."""
+
+    kind: str  # force_zero, displacement_zero or compliance
+    run: str
+    prior: float
+    rows: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Residuals and Jacobians of S parameter vectors: (S, residuals), (S, residuals, parameters).
+
+    Where the membrane has no state, ``answered`` (S,) is False, residuals are `INVALID_RESIDUAL` and slopes 0.
+    """
+
+    residual: Array
+    jacobian: Array
+    answered: NDArray[np.bool_]
+
+    @property
+    def cost(self) -> Array:
+        """Sums of squares (S,)."""
+        cost: Array = np.einsum("sr,sr->s", self.residual, self.residual)
+        return cost
+
+
 class Problem:
     """Residuals and Jacobian of one pass, with the choice of samples and their weights fixed.
 
-    The parameter vector ``x`` is ``[g_1..g_N, alpha_1..alpha_N, (eps_r), zeros...]``; zeros are in units of their
-    priors.
+    The parameter vector ``x`` is ``[g_1..g_N, alpha_1..alpha_N, (eps_r), nuisances...]``; nuisances are in units of
+    their priors. Each part of a curve is a row of ``nodes``, and ``active`` names the curve of each row.
+    ``solved`` counts the membrane states that were computed: rows times nodes for an evaluation, whatever the number
+    of samples.
     """
 
     def __init__(
@@ -50,42 +81,44 @@ class Problem:
         at: Material,
         *,
         trust_noise: bool = False,
+        nodes: int = NODES,
+        tolerance: float = TOLERANCE,
+        wrinkling: Wrinkling = "plain",
     ) -> None:
         self.curves = curves
         self.selections = selections
         self.terms = terms
         self.material = at
         self.scale = at.shear_modulus
-        self.active = [i for i, selection in enumerate(selections) if selection.used.any()]
+        self.tolerance = tolerance
+        self.wrinkling: Wrinkling = wrinkling
+        self.solved = 0
+        self.parts = [(i, part) for i, selection in enumerate(selections) for part in selection.parts]
+        self.active = [i for i, _ in self.parts]
         if not self.active:
             raise IdentificationError(
                 "no sample is left to fit: "
                 + "; ".join(_why_empty(c, s) for c, s in zip(curves, selections, strict=True))
             )
         self.electric = any(curves[i].nominal_voltage != 0.0 for i in self.active)
-        self.nodes = np.array([chebyshev_nodes(selections[i].low, selections[i].high, NODES) for i in self.active])
-        self.voltage = np.array([reference_voltage(curves[i], selections[i].used) for i in self.active])
-        # Zeros: (kind, run, prior, rows of the curves they shift)
-        self.zeros: list[tuple[str, str, float, list[int]]] = []
-        for run in dict.fromkeys(curves[i].run for i in self.active):
-            rows = [row for row, i in enumerate(self.active) if curves[i].run == run]
-            for kind in ("force_zero", "displacement_zero"):
-                prior = max(getattr(curves[self.active[row]], kind) for row in rows)
-                if prior > 0.0:
-                    self.zeros.append((kind, run, prior, rows))
+        self.nodes = np.array([chebyshev_nodes(part.low, part.high, nodes) for _, part in self.parts])
+        self.voltage = np.array([reference_voltage(curves[i], part.used) for i, part in self.parts])
+        self.nuisances = self._nuisances()
         self.names = [f"g{n + 1}" for n in range(terms)] + [f"alpha{n + 1}" for n in range(terms)]
         self.names += ["eps_r"] if self.electric else []
         self.film_parameters = len(self.names)
-        self.names += [f"{kind}_{k}" for k, (kind, *_) in enumerate(self.zeros)]
+        self.names += [f"{nuisance.kind}_{k}" for k, nuisance in enumerate(self.nuisances)]
 
-        states = self._solve(at, np.zeros(len(self.active)))
+        self._give = np.zeros_like(self.nodes)  # force (N) by which the rig gives way at the nodes
+        states = self._solve([at], np.zeros((1, *self.nodes.shape)))[0]
         if not np.isfinite(states.force).all():
             raise IdentificationError("the membrane has no state at the starting guess, where its status says it has")
+        self._give = states.force
         self.blocks: list[Block] = []
         self.block_rows: list[int] = []
-        for row, i in enumerate(self.active):
+        for row, (i, part) in enumerate(self.parts):
             model = NodeModel(states.force[row], states.by["h"][row], states.by["voltage"][row])
-            new = reduce(i, curves[i], selections[i], self.nodes[row], float(self.voltage[row]), model)
+            new = reduce(curves[i], part.used, self.nodes[row], float(self.voltage[row]), model)
             self.blocks += new
             self.block_rows += [row] * len(new)
         ratio, freedom = noise_ratio(self.blocks)
@@ -96,13 +129,27 @@ class Problem:
         self.correlation_time = 1.0 if trust_noise else correlation_time(self.blocks)
         self.inflation = self.excess * self.correlation_time
         self._roots = [block.root / math.sqrt(self.inflation) for block in self.blocks]
-        self._targets = [block.target / math.sqrt(self.inflation) for block in self.blocks]
-        self._last: tuple[bytes, Array, Array] | None = None
+        self._target = np.concatenate([block.target for block in self.blocks]) / math.sqrt(self.inflation)
+        self._last: tuple[bytes, Evaluation] | None = None
+
+    def _nuisances(self) -> list[Nuisance]:
+        found = []
+        for run in dict.fromkeys(self.curves[i].run for i in self.active):
+            rows = tuple(row for row, i in enumerate(self.active) if self.curves[i].run == run)
+            for kind in ("force_zero", "displacement_zero"):
+                prior = max(getattr(self.curves[self.active[row]], kind) for row in rows)
+                if prior > 0.0:
+                    found.append(Nuisance(kind, run, prior, rows))
+        rows = tuple(row for row, i in enumerate(self.active) if self.curves[i].compliance_uncertainty > 0.0)
+        if rows:
+            prior = max(self.curves[self.active[row]].compliance_uncertainty for row in rows)
+            found.append(Nuisance("compliance", "the rig", prior, rows))
+        return found
 
     @property
     def data_rows(self) -> int:
-        """Residuals that come from data; one for each zero follows."""
-        return sum(root.shape[0] for root in self._roots)
+        """Residuals that come from data; one for each nuisance follows."""
+        return self._target.size
 
     def film(self, x: Array) -> Material:
         """The material of a parameter vector."""
@@ -112,56 +159,79 @@ class Problem:
         return Material(name="identified", mu=tuple(mu), alpha=tuple(x[n : 2 * n]), eps_r=eps_r)
 
     def vector(self, material: Material) -> Array:
-        """The parameter vector of a material, zeros at zero."""
+        """The parameter vector of a material, nuisances at zero."""
         mu, alpha = np.array(material.mu), np.array(material.alpha)
         eps = [material.eps_r] if self.electric else []
-        return np.concatenate((mu * alpha / (2.0 * self.scale), alpha, eps, np.zeros(len(self.zeros))))
+        return np.concatenate((mu * alpha / (2.0 * self.scale), alpha, eps, np.zeros(len(self.nuisances))))
 
     def by_parameters(self, x: Array, by_mu: Array, by_alpha: Array, by_eps: Array) -> Array:
-        """Derivatives by x from derivatives by mu, alpha (both (..., N)) and eps_r (...); zeros get 0."""
+        """Derivatives by x (..., P) from those by mu, alpha (both (..., N)) and eps_r (...); nuisances get 0."""
         n = self.terms
-        alpha = x[n : 2 * n]
-        mu = 2.0 * self.scale * x[:n] / alpha
+        alpha = x[..., n : 2 * n]
+        mu = 2.0 * self.scale * x[..., :n] / alpha
         parts = [by_mu * 2.0 * self.scale / alpha, by_alpha - by_mu * mu / alpha]
         if self.electric:
             parts.append(by_eps[..., None])
-        parts.append(np.zeros((*by_mu.shape[:-1], len(self.zeros))))
+        parts.append(np.zeros((*by_mu.shape[:-1], len(self.nuisances))))
         return np.concatenate(parts, axis=-1)
 
     def residual(self, x: Array) -> Array:
-        """Weighted residuals, model minus measurement: reduced data, then zeros in units of their priors."""
-        return self._evaluate(x)[0]
+        """Weighted residuals, model minus measurement: reduced data, then nuisances in units of their priors."""
+        residual: Array = self._one(x).residual[0]
+        return residual
 
     def jacobian(self, x: Array) -> Array:
         """Derivatives of `residual` by x, shape (residuals, parameters)."""
-        return self._evaluate(x)[1]
+        jacobian: Array = self._one(x).jacobian[0]
+        return jacobian
 
     def answers(self, x: Array) -> bool:
         """Whether the membrane has a state at every node for these parameters."""
-        return bool((np.abs(self.residual(x)) < INVALID_RESIDUAL).all())
+        return bool(self._one(x).answered[0])
 
     def states(self, x: Array) -> States:
-        """The model at the nodes, displacement zeros included and force zeros not."""
-        shift = np.zeros(len(self.active))
-        for value, (kind, _, prior, rows) in zip(x[self.film_parameters :], self.zeros, strict=True):
-            if kind == "displacement_zero":
-                shift[rows] += value * prior
-        return self._solve(self.film(x), shift)
+        """The model at the nodes, errors of the displacement included and force zeros not."""
+        return self._solve([self.film(x)], self._shift(x[None]))[0]
 
     def project(self, at_nodes: Array) -> Array:
-        """Weighted residual rows of changes of the force at the nodes, shape (curves, nodes, ...); zeros get 0."""
-        rows = [root @ at_nodes[row] for root, row in zip(self._roots, self.block_rows, strict=True)]
-        return np.concatenate([*rows, np.zeros((len(self.zeros), *at_nodes.shape[2:]))])
+        """Weighted residual rows of changes of the force at the nodes, (..., rows, nodes, P); nuisances get 0."""
+        rows = [root @ at_nodes[..., row, :, :] for root, row in zip(self._roots, self.block_rows, strict=True)]
+        nothing = np.zeros((*at_nodes.shape[:-3], len(self.nuisances), at_nodes.shape[-1]))
+        return np.concatenate([*rows, nothing], axis=-2)
+
+    def evaluate(self, points: Array, *, slopes: bool = True) -> Evaluation:
+        """Residuals and Jacobians of many parameter vectors (S, P), their membrane states all solved together."""
+        count, data = len(points), self.data_rows
+        solved = self._solve([self.film(x) for x in points], self._shift(points), slopes=slopes)
+        force = solved.force.copy()
+        for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
+            if nuisance.kind == "force_zero":
+                force[:, nuisance.rows] += (points[:, k] * nuisance.prior)[:, None, None]
+        residual = self.project(force[..., None])[..., 0]
+        residual[:, :data] -= self._target
+        residual[:, data:] = points[:, self.film_parameters :]
+        jacobian = np.zeros((count, residual.shape[1], points.shape[1]))
+        if slopes:
+            by = self.by_parameters(points[:, None, None], *(solved.by[name] for name in ("mu", "alpha", "eps_r")))
+            for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
+                rows = list(nuisance.rows)
+                by[..., k][:, rows] = self._by_nuisance(nuisance, solved)
+            jacobian = self.project(by)
+            jacobian[:, data:, self.film_parameters :] = np.eye(len(self.nuisances))
+        answered = np.asarray(np.isfinite(force).all(axis=(1, 2)))
+        residual[~answered] = INVALID_RESIDUAL
+        jacobian[~answered] = 0.0
+        return Evaluation(residual, jacobian, answered)
 
     def samples(self, row: int, x: Array, states: States) -> tuple[Array, Array, Array]:
-        """Of an active curve's used samples: residual (measured minus model, N), its deviation, displacement."""
-        i = self.active[row]
-        curve, used = self.curves[i], self.selections[i].used
+        """Of the used samples of a row: residual (measured minus model, N), its deviation, displacement."""
+        i, part = self.parts[row]
+        curve, used = self.curves[i], part.used
         matrix = interpolation_matrix(self.nodes[row], curve.h[used])
         model = matrix @ states.force[row]
-        for value, (kind, _, prior, rows) in zip(x[self.film_parameters :], self.zeros, strict=True):
-            if kind == "force_zero" and row in rows:
-                model += value * prior
+        for value, nuisance in zip(x[self.film_parameters :], self.nuisances, strict=True):
+            if nuisance.kind == "force_zero" and row in nuisance.rows:
+                model += value * nuisance.prior
         reference = float(self.voltage[row])
         if reference > 0.0:
             by_square = states.by["voltage"][row] / (2 * reference)
@@ -169,54 +239,64 @@ class Problem:
         sigma = np.hypot(curve.force_noise, matrix @ states.by["h"][row] * curve.displacement_noise)
         return curve.force[used] - model, sigma, curve.h[used]
 
-    def _evaluate(self, x: Array) -> tuple[Array, Array]:
+    def interpolation_error(self, states: States) -> Array:
+        """Estimated error (N) of the interpolant of each row: what the last two of its Chebyshev terms amount to."""
+        count = self.nodes.shape[1]
+        angle = (2 * np.arange(count) + 1) * np.pi / (2 * count)
+        last = np.array([np.cos(k * angle) for k in (count - 1, count - 2)]) * 2.0 / count
+        found: Array = np.abs(states.force @ last.T).max(axis=1)
+        return found
+
+    def _by_nuisance(self, nuisance: Nuisance, solved: States) -> Array:
+        rows = list(nuisance.rows)
+        if nuisance.kind == "force_zero":
+            return np.full((len(solved.force), len(rows), self.nodes.shape[1]), nuisance.prior)
+        slope = nuisance.prior * solved.by["h"][:, rows]
+        return slope if nuisance.kind == "displacement_zero" else -slope * self._give[rows]
+
+    def _shift(self, points: Array) -> Array:
+        """What the errors of the displacement add to the nodes (m), shape (S, rows, nodes)."""
+        shift = np.zeros((len(points), *self.nodes.shape))
+        for values, nuisance in zip(points.T[self.film_parameters :], self.nuisances, strict=True):
+            rows = list(nuisance.rows)
+            size = (values * nuisance.prior)[:, None, None]
+            if nuisance.kind == "displacement_zero":
+                shift[:, rows] += size
+            elif nuisance.kind == "compliance":
+                shift[:, rows] -= size * self._give[rows]
+        return shift
+
+    def _one(self, x: Array) -> Evaluation:
         key = x.tobytes()
-        if self._last is not None and self._last[0] == key:
-            return self._last[1], self._last[2]
-        states = self.states(x)
-        if np.isfinite(states.force).all():
-            slopes = self.by_parameters(x, states.by["mu"], states.by["alpha"], states.by["eps_r"])
-            force = states.force.copy()
-            for k, (kind, _, prior, rows) in enumerate(self.zeros, start=self.film_parameters):
-                if kind == "force_zero":
-                    force[rows] += x[k] * prior
-                    slopes[rows, :, k] = prior
-                else:
-                    slopes[rows, :, k] = prior * states.by["h"][rows]
-            residual = self.project(force)
-            residual[: self.data_rows] -= np.concatenate(self._targets)
-            residual[self.data_rows :] = x[self.film_parameters :]
-            jacobian = self.project(slopes)
-            jacobian[self.data_rows :, self.film_parameters :] = np.eye(len(self.zeros))
-        else:
-            residual = np.full(self.data_rows + len(self.zeros), INVALID_RESIDUAL)
-            jacobian = np.zeros((residual.size, x.size))
-        self._last = (key, residual, jacobian)
-        return residual, jacobian
+        if self._last is None or self._last[0] != key:
+            self._last = (key, self.evaluate(x[None]))
+        return self._last[1]
 
-    def _solve(self, material: Material, shift: Array) -> States:
+    def _solve(self, materials: Sequence[Material], shift: Array, *, slopes: bool = True) -> States:
+        specimens = np.empty((len(materials), len(self.active), 1), dtype=np.object_)
+        known: dict[tuple[int, int], Specimen] = {}  # the curves of one specimen share it, so that its numbers are once
+        for s, material in enumerate(materials):
+            for row, i in enumerate(self.active):
+                here = self.curves[i].specimen
+                key = (s, id(here))
+                if key not in known:
+                    known[key] = here.with_material(material)
+                specimens[s, row, 0] = known[key]
         solved = solve_many(
-            films(self.curves, self.active, material),
-            self.nodes + shift[:, None],
+            specimens,
+            self.nodes + shift,
             self.voltage[:, None],
-            tolerance=TOLERANCE,
-            sensitivities=True,
+            tolerance=self.tolerance,
+            wrinkling=self.wrinkling,
+            sensitivities=slopes,
         )
-        if solved.dforce is None:
-            raise RuntimeError("the membrane model returned no sensitivities")
-        return States(solved.force, solved.dforce, solved.max_stretch)
-
-
-def films(curves: Sequence[Curve], active: Sequence[int], material: Material) -> NDArray[np.object_]:
-    """The specimens of the active curves, made of ``material``; shape (curves, 1)."""
-    column = np.empty((len(active), 1), dtype=np.object_)
-    column[:, 0] = [curves[i].specimen.with_material(material) for i in active]
-    return column
+        self.solved += solved.force.size
+        return States(solved.force, solved.dforce or {}, solved.max_stretch)
 
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """The model at the nodes of all active curves: arrays of shape (curves, nodes), by mu and alpha (curves, nodes, N).
+    """The model at the nodes: arrays of shape (rows, nodes), by mu and alpha (rows, nodes, N), or with S before.
 
     ``by`` holds the derivatives of the force, with the keys of `model.membrane.Solutions.dforce`.
     """
@@ -224,6 +304,10 @@ class States:
     force: Array
     by: dict[str, Array]
     max_stretch: Array
+
+    def __getitem__(self, index: int) -> States:
+        by = {name: values[index] for name, values in self.by.items()}
+        return States(self.force[index], by, self.max_stretch[index])
 
 
 def _why_empty(curve: Curve, selection: Selection) -> str:

@@ -20,14 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.problem import Problem
-from calibration.propagation import SYSTEMATIC, Covariance, secant
+from calibration.propagation import NUISANCES, SYSTEMATIC, Covariance, secant
 from calibration.result import Quantity, verdict
+from calibration.search import Minimum, minimise_many
 
 Array = NDArray[np.float64]
 Target = Callable[[Array], tuple[float, Array]]  # value and gradient of a quantity at x
 
 COST_95 = 3.841  # 95 % quantile of chi-square with one degree of freedom
 NORMAL_95 = 1.960  # its square root
+STEP_LIMIT, ROUNDS = 15, 1
 EXPONENTS = (0.2, 1.0, 2.0, 3.0, 4.0, 4.7, 5.4, 6.1, 7.0, 8.0, 10.0, 14.0, 20.0)
 
 
@@ -57,36 +59,34 @@ def intervals(
     if n == 1 or not varied[n]:
         return {name: (low, high) for name, (low, high) in ends.items()}
     steps = _steps(problem, x, bounds, varied)
-    least = min(cost for _, cost, _ in steps)
-    for name, target in aims.items():
-        reached: list[float] = []
-        for at, cost, free in steps:
-            room = COST_95 - (cost - least) / misfit
-            if room > 0.0:
-                value, gradient = target(at)
-                for side in (-1.0, 1.0):
-                    reached.append(value + side * _half(problem, at, free, bounds, gradient * side, room * misfit))
-        ends[name] = [min(reached), max(reached)]
+    least = min(step.cost for step in steps)
+    ends = {name: [math.inf, -math.inf] for name in aims}
+    for step in steps:
+        room = COST_95 - (step.cost - least) / misfit
+        if room <= 0.0:
+            continue
+        free = varied.copy()
+        free[n : 2 * n] &= step.x[:n] > 100 * bounds[0][:n]  # a vanished term's exponent means nothing
+        free[n] = False
+        for name, target in aims.items():
+            value, gradient = target(step.x)
+            for side, end in ((-1.0, 0), (1.0, 1)):
+                reached = value + side * _half(step, n, free, bounds, gradient * side, room * misfit)
+                ends[name][end] = (min, max)[end](ends[name][end], reached)
     return {name: (low, high) for name, (low, high) in ends.items()}
 
 
 def _half(
-    problem: Problem,
-    at: Array,
-    free: NDArray[np.bool_],
-    bounds: tuple[Array, Array],
-    gradient: Array,
-    room: float,
+    step: Minimum, n: int, free: NDArray[np.bool_], bounds: tuple[Array, Array], gradient: Array, room: float
 ) -> float:
     """How far a quantity can rise before chi-square has risen by ``room``; no share leaves its bounds on the way."""
-    n = problem.terms
     for _ in range(n + 1):
-        response = Covariance(problem, at, free).response
+        response = Covariance(step.jacobian, free).response
         rows = gradient @ response
         deviation = float(np.linalg.norm(rows))
         if deviation == 0.0:
             return 0.0
-        end = at + math.sqrt(room) / deviation * (response @ rows)
+        end = step.x + math.sqrt(room) / deviation * (response @ rows)
         outside = free[:n] & ((end[:n] < bounds[0][:n]) | (end[:n] > bounds[1][:n]))
         if not outside.any():
             return math.sqrt(room) * deviation
@@ -95,66 +95,40 @@ def _half(
     return 0.0
 
 
-def _steps(
-    problem: Problem, x: Array, bounds: tuple[Array, Array], varied: NDArray[np.bool_]
-) -> list[tuple[Array, float, NDArray[np.bool_]]]:
-    """The minimum with the first exponent held, for every exponent of the range that has one: x, cost, free entries."""
+def _steps(problem: Problem, x: Array, bounds: tuple[Array, Array], varied: NDArray[np.bool_]) -> list[Minimum]:
+    """Minima with the first exponent held, for every exponent of the range that has one.
+
+    All are sought at once from the minimum, and then again from what was found for the neighbours.
+    """
     n = problem.terms
     sign = math.copysign(1.0, x[n])
-    ladder = sorted({*EXPONENTS, abs(float(x[n]))})
-    middle = ladder.index(abs(float(x[n])))
-    steps = []
-    for way in (ladder[middle:], ladder[:middle][::-1]):  # outwards from the minimum, each from its neighbour
-        start = x
-        for exponent in way:
-            found = _held(problem, start, sign * exponent, bounds, varied)
-            if found is not None:
-                steps.append(found)
-                start = found[0]
-    return steps
-
-
-def _held(
-    problem: Problem, start: Array, exponent: float, bounds: tuple[Array, Array], varied: NDArray[np.bool_]
-) -> tuple[Array, float, NDArray[np.bool_]] | None:
-    from scipy.optimize import least_squares
-
-    n = problem.terms
+    ladder = sign * np.array(sorted({*EXPONENTS, abs(float(x[n]))}))
     fitted = varied.copy()
     fitted[n] = False
-    first = start.copy()
-    first[n] = exponent
-    first[:n] = np.maximum(first[:n], 0.02)  # off the bound, where a term could not come back to life
-    first[fitted] = np.clip(first[fitted], bounds[0][fitted] + 1e-9, bounds[1][fitted] - 1e-9)
-    if not problem.answers(first):
-        return None
 
-    def full(part: Array) -> Array:
-        whole = first.copy()
-        whole[fitted] = part
-        return whole
+    def sought(starts: list[Array]) -> list[Minimum | None]:
+        points = np.array(starts)
+        points[:, :n] = np.maximum(points[:, :n], 0.02)  # off the bound, where a term could not come back to life
+        sides = (np.broadcast_to(bounds[0], points.shape), np.broadcast_to(bounds[1], points.shape))
+        return minimise_many(problem, points, sides, fitted, limit=STEP_LIMIT)
 
-    def residual(part: Array) -> Array:
-        return problem.residual(full(part))
+    def moved(point: Array, exponent: float) -> Array:
+        return np.concatenate((point[:n], [exponent], point[n + 1 :]))
 
-    def jacobian(part: Array) -> Array:
-        return problem.jacobian(full(part))[:, fitted]
-
-    found = least_squares(
-        residual,
-        first[fitted],
-        jacobian,
-        bounds=(bounds[0][fitted], bounds[1][fitted]),
-        x_scale="jac",
-        ftol=1e-5,
-        max_nfev=30,
-    )
-    at = full(found.x)
-    if not problem.answers(at):
-        return None
-    free = fitted.copy()
-    free[n : 2 * n] &= at[:n] > 100 * bounds[0][:n]  # a vanished term's exponent means nothing
-    return at, float(2.0 * found.cost), free
+    best = sought([moved(x, exponent) for exponent in ladder])
+    for _ in range(ROUNDS):
+        pairs = [
+            (k, near.x)
+            for k in range(len(ladder))
+            for j in (k - 1, k + 1)
+            if 0 <= j < len(ladder) and (near := best[j]) is not None
+        ]
+        again = sought([moved(point, ladder[k]) for k, point in pairs])
+        for (k, _), found in zip(pairs, again, strict=True):
+            here = best[k]
+            if found is not None and (here is None or found.cost < here.cost):
+                best[k] = found
+    return [one for one in best if one is not None]
 
 
 def targets(problem: Problem, stretch: tuple[float, float], held: Collection[str]) -> dict[str, Target]:
@@ -188,7 +162,8 @@ def widened(quantity: Quantity, ends: tuple[float, float], misfit: float) -> Qua
 
     The profile knows noise, zeros and misfit; the systematic parts are added to its half-widths in squares.
     """
-    systematic = math.hypot(*(quantity.budget[part] for part, *_ in SYSTEMATIC if part in quantity.budget))
+    parts = [*(part for part, *_ in SYSTEMATIC), "eccentricity"]
+    systematic = math.hypot(*(quantity.budget.get(part, 0.0) for part in parts))
     low, high = (
         quantity.value + math.copysign(math.hypot(end - quantity.value, NORMAL_95 * systematic), end - quantity.value)
         for end in ends
@@ -213,5 +188,5 @@ def widened(quantity: Quantity, ends: tuple[float, float], misfit: float) -> Qua
 
 def _random(quantity: Quantity, misfit: float) -> float:
     """Linear standard uncertainty from noise and zeros, enlarged by the misfit."""
-    parts = (quantity.budget.get(part, 0.0) for part in ("noise", "force zero", "displacement zero"))
+    parts = (quantity.budget.get(part, 0.0) for part in ("noise", *(kind.replace("_", " ") for kind in NUISANCES)))
     return math.hypot(*parts) * math.sqrt(misfit)

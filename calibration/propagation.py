@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.curve import Curve
 from calibration.problem import Problem
 from calibration.result import Quantity, Stiffness, Zero, verdict
 from model.materials import Material
@@ -25,6 +26,19 @@ SYSTEMATIC = (
     ("pre-stretch", "prestretch_uncertainty", "prestretch"),
     ("disk radius", "disk_radius_uncertainty", "disk_radius"),
 )
+
+
+NUISANCES = {"force_zero": "N", "displacement_zero": "m", "compliance": "m/N"}  # what is fitted along, and its unit
+
+
+def stiffening(curve: Curve) -> float:
+    """Relative rise of the force when the disk sits off the ring's centre by the curve's ``eccentricity``.
+
+    A membrane under even tension carries the disk like a field its charge: the stiffness goes with the capacitance of
+    the two circles, ``1/arcosh((a^2 + b^2 - e^2)/(2 a b))``. It can only rise; the rise is taken as its uncertainty.
+    """
+    a, b, e = curve.specimen.disk_radius, curve.specimen.ring_radius, curve.eccentricity
+    return math.log(b / a) / math.acosh((a * a + b * b - e * e) / (2.0 * a * b)) - 1.0 if e > 0.0 else 0.0
 
 
 def secant_modulus(material: Material, meridional: float, hoop: float) -> float:
@@ -54,13 +68,14 @@ class Covariance:
     are kept with a tiny singular value, so that their uncertainty comes out huge rather than absent.
     """
 
-    def __init__(self, problem: Problem, x: Array, free: NDArray[np.bool_]) -> None:
-        jacobian = problem.jacobian(x)[:, free]
+    def __init__(self, jacobian: Array, free: NDArray[np.bool_]) -> None:
+        columns = jacobian.shape[1]
+        jacobian = jacobian[:, free]
         norms = np.linalg.norm(jacobian, axis=0)
         norms[norms == 0.0] = 1e-30
         u, s, vt = np.linalg.svd(jacobian / norms, full_matrices=False)
         s = np.maximum(s, 1e-13 * s[0])
-        self.response = np.zeros((x.size, jacobian.shape[0]))
+        self.response = np.zeros((columns, jacobian.shape[0]))
         self.response[free] = -(vt.T / s) @ u.T / norms[:, None]
 
     @property
@@ -87,7 +102,7 @@ class Propagation:
     ) -> None:
         self.problem = problem
         self.film = problem.film(x)
-        self.covariance = Covariance(problem, x, free)
+        self.covariance = Covariance(problem.jacobian(x), free)
         self.misfit = misfit
         self.rivals = rivals
         self.effects: dict[str, Array] = {}
@@ -96,7 +111,11 @@ class Propagation:
             relative = np.array([getattr(problem.curves[i], uncertainty) for i in problem.active])[:, None]
             if relative.any():
                 change = states.force if scales == "force" else states.by[scales] * self._size(scales)
-                self.effects[part] = self.covariance.response @ problem.project(relative * change)
+                self.effects[part] = self.covariance.response @ problem.project((relative * change)[..., None])[:, 0]
+        tilted = np.array([stiffening(problem.curves[i]) for i in problem.active])[:, None]
+        if tilted.any():
+            shift = problem.project((tilted * states.force)[..., None])[:, 0]
+            self.effects["eccentricity"] = self.covariance.response @ shift
 
     def _size(self, name: str) -> Array:
         """Displacement, voltage or a dimension of the specimen at the nodes of every active curve."""
@@ -126,8 +145,8 @@ class Propagation:
         rows = gradient @ self.covariance.response
         data = self.problem.data_rows
         parts = {"noise": float(np.linalg.norm(rows[:data]))}
-        for kind in ("force_zero", "displacement_zero"):
-            mine = [data + k for k, zero in enumerate(self.problem.zeros) if zero[0] == kind]
+        for kind in NUISANCES:
+            mine = [data + k for k, nuisance in enumerate(self.problem.nuisances) if nuisance.kind == kind]
             if mine:
                 parts[kind.replace("_", " ")] = float(np.linalg.norm(rows[mine]))
         if self.misfit > 1.0:
@@ -209,15 +228,14 @@ def state(
         )
 
     nuisance = {}
-    for k, (kind, run, prior, _) in enumerate(problem.zeros, start=problem.film_parameters):
+    for k, one in enumerate(problem.nuisances, start=problem.film_parameters):
         slope = np.zeros(x.size)
-        slope[k] = prior
-        budget = propagation.budget(slope)
-        nuisance[f"{kind.replace('_', ' ')} of {run}"] = Zero(
-            value=float(x[k] * prior),
-            uncertainty=math.hypot(*budget.values()),
-            prior=prior,
-            unit="N" if kind == "force_zero" else "m",
+        slope[k] = one.prior
+        nuisance[f"{one.kind.replace('_', ' ')} of {one.run}"] = Zero(
+            value=float(x[k] * one.prior),
+            uncertainty=math.hypot(*propagation.budget(slope).values()),
+            prior=one.prior,
+            unit=NUISANCES[one.kind],
         )
     return Statement(
         quantities=quantities,

@@ -12,6 +12,7 @@ smooth curve can explain: it measures the noise. The first part tests the model 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from calibration.curve import Curve
 from model.materials import Material
-from model.membrane import Status, solve_many
+from model.membrane import Status, Wrinkling, solve_many
 
 Array = NDArray[np.float64]
 
@@ -49,68 +50,140 @@ def interpolation_matrix(nodes: Array, points: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Selection:
-    """Which samples of a curve the taut membrane model can describe.
-
-    ``excluded`` counts the others by reason. ``low`` and ``high`` (m) bound the displacements of the ones used.
-    """
+class Part:
+    """Samples of a curve between two displacements (m) over which the model is one smooth function."""
 
     used: NDArray[np.bool_]
-    excluded: dict[str, int]
     low: float
     high: float
 
 
-def select(curves: Sequence[Curve], material: Material) -> list[Selection]:
-    """Leave out samples without a value, flagged ones, those before contact, and those where ``material`` is not taut.
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Which samples of a curve the membrane model can describe, in one or more smooth parts.
 
-    Of each curve the stretch of displacements with the most samples in which the film is taut throughout is kept.
+    ``excluded`` counts the others by reason, ``wrinkled`` the samples at which the film is wrinkled, used or not.
     """
-    return [_select(curve, material) for curve in curves]
+
+    parts: tuple[Part, ...]
+    excluded: dict[str, int]
+    size: int
+    wrinkled: int = 0
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Samples in any part."""
+        used = np.zeros(self.size, dtype=np.bool_)
+        for part in self.parts:
+            used |= part.used
+        return used
+
+    @property
+    def low(self) -> float:
+        """Least displacement used (m); 0 when there is none."""
+        return min((part.low for part in self.parts), default=0.0)
+
+    @property
+    def high(self) -> float:
+        """Largest displacement used (m); 0 when there is none."""
+        return max((part.high for part in self.parts), default=0.0)
 
 
-def _select(curve: Curve, material: Material) -> Selection:
+def select(curves: Sequence[Curve], material: Material, wrinkling: Wrinkling = "plain") -> list[Selection]:
+    """Leave out samples without a value, flagged ones, those before contact, and those the model does not describe.
+
+    With "plain" only the taut film is described: of each curve the stretch of displacements with the most samples in
+    which the film is taut throughout is kept. With "tension_field" wrinkled states are described too; a curve is cut
+    where wrinkles begin or end, because the force has a kink of higher order there.
+    """
+    given = [_given(curve) for curve in curves]
+    rows = [i for i, (used, _) in enumerate(given) if used.any()]
+    grids = np.zeros((len(rows), GRID))
+    voltage = np.zeros((len(rows), 1))
+    for row, i in enumerate(rows):
+        h = curves[i].h[given[i][0]]
+        grids[row] = np.linspace(h.min(), max(h.max(), h.min() + 1e-9), GRID)
+        voltage[row] = reference_voltage(curves[i], given[i][0])
+    films = np.empty((len(rows), 1), dtype=np.object_)
+    films[:, 0] = [curves[i].specimen.with_material(material) for i in rows]
+    status = solve_many(films, grids, voltage, wrinkling=wrinkling).status
+    found = []
+    for i, curve in enumerate(curves):
+        used, excluded = given[i]
+        if i not in rows:
+            found.append(Selection((), excluded, curve.h.size))
+            continue
+        row = rows.index(i)
+        found.append(_divide(curve, used, excluded, grids[row], status[row], wrinkling))
+    return found
+
+
+def _given(curve: Curve) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    """Samples that hold a measurement of the film at the curve's voltage, and why the others do not."""
     excluded: dict[str, int] = {}
     used = np.ones(curve.h.size, dtype=np.bool_)
-
-    def drop(which: NDArray[np.bool_], reason: str) -> None:
-        nonlocal used
-        count = int((used & which).sum())
-        if count:
-            excluded[reason] = excluded.get(reason, 0) + count
-        used = used & ~which
-
-    if curve.flagged is not None:
-        drop(curve.flagged, "flagged by an instrument")
-    drop(~curve.usable, "without a value")
     off = np.abs(np.abs(curve.voltage) - abs(curve.nominal_voltage)) > VOLTAGE_MARGIN * abs(curve.nominal_voltage)
-    drop(off & (curve.nominal_voltage != 0.0), "away from the nominal voltage")
-    # Closer than this to the zero the tip may not touch the film yet, and a free tip pulls with no force.
-    drop(curve.h < CONTACT_MARGIN * curve.displacement_zero, "before contact")
-    if not used.any():
-        return Selection(used, excluded, 0.0, 0.0)
-    grid = np.linspace(curve.h[used].min(), max(curve.h[used].max(), curve.h[used].min() + 1e-9), GRID)
-    specimen = curve.specimen.with_material(material)
-    status = solve_many(specimen, grid, reference_voltage(curve, used)).status
-    taut = status == Status.TAUT
-    if not taut.all():
-        state = np.full(curve.h.size, -1)
-        place = (curve.h[used] - grid[0]) / (grid[-1] - grid[0]) * (GRID - 1)
-        state[used] = status[np.rint(place).astype(np.intp)]
-        first, last = _longest(taut, curve.h[used], grid)
-        outside = (curve.h < first) | (curve.h > last)
-        for value in np.unique(state[used]):
-            reason = "next to a state that is not taut" if value == Status.TAUT else Status(value).name.lower()
-            drop((state == value) & outside, reason.replace("_", " "))
-    if not used.any():
-        return Selection(used, excluded, 0.0, 0.0)
-    return Selection(used, excluded, float(curve.h[used].min()), float(curve.h[used].max()))
+    flagged = np.zeros_like(used) if curve.flagged is None else curve.flagged
+    for which, reason in (
+        (flagged, "flagged by an instrument"),
+        (~curve.usable, "without a value"),
+        (off & (curve.nominal_voltage != 0.0), "away from the nominal voltage"),
+        # Closer than this to the zero the tip may not touch the film yet, and a free tip pulls with no force.
+        (curve.h < CONTACT_MARGIN * curve.displacement_zero, "before contact"),
+    ):
+        _count(excluded, reason, used & which)
+        used &= ~which
+    return used, excluded
 
 
-def _longest(taut: NDArray[np.bool_], h: Array, grid: Array) -> tuple[float, float]:
-    """Ends of the run of taut grid points with the most samples; an empty interval if there is none."""
+def _divide(
+    curve: Curve,
+    given: NDArray[np.bool_],
+    excluded: dict[str, int],
+    grid: Array,
+    status: NDArray[np.int8],
+    wrinkling: Wrinkling,
+) -> Selection:
+    """Cut the samples ``given`` of a curve into parts, by the status of the film on a grid of displacements."""
+    place = np.rint((curve.h[given] - grid[0]) / (grid[-1] - grid[0]) * (GRID - 1)).astype(np.intp)
+    state = np.full(curve.h.size, -1)
+    state[given] = status[place]
+    wrinkled = int((state == Status.WRINKLED).sum())
+    described = status == Status.TAUT
+    if wrinkling == "tension_field":
+        described |= status == Status.WRINKLED
+    first, last = _longest(described, curve.h[given], grid)
+    inside = given & (curve.h >= first) & (curve.h <= last)
+    for value in np.unique(state[given & ~inside]):
+        if value == Status.TAUT or (value == Status.WRINKLED and wrinkling == "tension_field"):
+            reason = "next to a state that is not taut"
+        else:
+            reason = Status(value).name.lower().replace("_", " ")
+        _count(excluded, reason, given & ~inside & (state == value))
+    cuts = [first, last]
+    if inside.any():
+        changes = np.flatnonzero(np.diff(status)) if wrinkling == "tension_field" else np.empty(0, dtype=np.intp)
+        middle = [0.5 * (grid[k] + grid[k + 1]) for k in changes if first <= grid[k] and grid[k + 1] <= last]
+        cuts = [first, *middle, last]
+    parts = []
+    for low, high in itertools.pairwise(cuts):
+        used = inside & (curve.h >= low) & ((curve.h < high) if high < last else (curve.h <= high))
+        if used.any():
+            least = float(curve.h[used].min())
+            parts.append(Part(used, least, max(float(curve.h[used].max()), least + 1e-9)))
+    return Selection(tuple(parts), excluded, curve.h.size, wrinkled)
+
+
+def _count(excluded: dict[str, int], reason: str, which: NDArray[np.bool_]) -> None:
+    count = int(which.sum())
+    if count:
+        excluded[reason] = excluded.get(reason, 0) + count
+
+
+def _longest(described: NDArray[np.bool_], h: Array, grid: Array) -> tuple[float, float]:
+    """Ends of the run of grid points that are described with the most samples; an empty interval if there is none."""
     best, ends = 0, (np.inf, -np.inf)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], taut.astype(np.int8), [0]))))
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], described.astype(np.int8), [0]))))
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
         low, high = float(grid[start]), float(grid[stop - 1])
         count = int(((h >= low) & (h <= high)).sum())
@@ -131,13 +204,11 @@ def reference_voltage(curve: Curve, used: NDArray[np.bool_]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Samples of one curve in one direction, reduced: ``chi2 = |root @ f - target|^2 + floor``.
+    """Samples of one part of a curve in one direction, reduced: ``chi2 = |root @ f - target|^2 + floor``.
 
-    ``curve`` is the index of the curve, ``samples`` its number of samples, ``noise`` their residuals to the smooth
-    curve nearest to them, in standard deviations.
+    ``samples`` is their number, ``noise`` their residuals to the smooth curve nearest to them, in standard deviations.
     """
 
-    curve: int
     samples: int
     root: Array  # (k, nodes)
     target: Array  # (k,)
@@ -154,15 +225,15 @@ class NodeModel:
     by_voltage: Array
 
 
-def reduce(index: int, curve: Curve, selection: Selection, nodes: Array, voltage: float, at: NodeModel) -> list[Block]:
-    """Reduce the used samples of a curve, loading and unloading apart.
+def reduce(curve: Curve, used: NDArray[np.bool_], nodes: Array, voltage: float, at: NodeModel) -> list[Block]:
+    """Reduce the used samples of a part of a curve, loading and unloading apart.
 
     ``at`` is the latest knowledge of the model at ``nodes`` and ``voltage``. It carries each sample from its own
     voltage to ``voltage`` and turns the noise of the displacement into one of the force.
     """
     blocks = []
     for direction in (1, 0, -1):
-        rows = selection.used & (curve.direction == direction)
+        rows = used & (curve.direction == direction)
         if not rows.any():
             continue
         matrix = interpolation_matrix(nodes, curve.h[rows])
@@ -178,7 +249,6 @@ def reduce(index: int, curve: Curve, selection: Selection, nodes: Array, voltage
         noise = force - base @ target
         blocks.append(
             Block(
-                curve=index,
                 samples=int(rows.sum()),
                 root=root,
                 target=target,
