@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.roles import DisplacementSample, ForceSample, HVFlag, Sample, StageSample
+from rig.control import Question
 from rig.errors import FaultError, LimitError
 from rig.plan import Action
+from rig.safety.guard import SAFE_VOLTAGE, GuardState
 from rig.watch import check_zero
 
 if TYPE_CHECKING:
@@ -247,7 +249,17 @@ def _go(engine: Engine, h: float, speed: float, limit: float) -> Turns:
 
 def _set_voltage(engine: Engine, action: Action) -> Turns:
     """Ramp and wait for the *measured* voltage to arrive, then settle."""
-    target = action.voltage[1]
+    yield from _ramp_to(engine, action.voltage[1], _patience(action))
+    yield from _pause(engine, action.parameters["settle"])
+
+
+def _ramp_to(engine: Engine, target: float, limit: float) -> Turns:
+    """Ramp, and wait until the measured voltage is there. A guard that is SAFE needs the operator's confirmation."""
+    guard = engine.guard
+    if guard is not None and guard.state is GuardState.SAFE:
+        if target == 0.0:
+            return  # off and measured so: nothing to arm for
+        yield from confirm_voltage(engine)
     tolerance = max(10.0, 0.01 * target)
     engine.request_voltage(target)
 
@@ -260,8 +272,83 @@ def _set_voltage(engine: Engine, action: Action) -> Turns:
             and abs(sample.voltage - target) <= tolerance
         )
 
-    yield from _wait(engine, arrived, _patience(action), f"The measured voltage's arrival at {target:g} V")
-    yield from _pause(engine, action.parameters["settle"])
+    yield from _wait(engine, arrived, limit, f"The measured voltage's arrival at {target:g} V")
+
+
+def _prompt(engine: Engine, action: Action) -> Turns:
+    """Ask the operator; whoever is asked may touch the rig, so the voltage is off and latched before."""
+    yield from _take_down(engine, "the operator is asked")
+    yield from engine.ask(Question(action.label))
+
+
+def confirm_voltage(engine: Engine) -> Turns:
+    """The second key: the operator types the highest voltage. Nothing is asked while his last word still holds."""
+    highest = engine.highest_voltage
+    if engine.arming.allows(highest):
+        return
+    engine.arming.withdraw()
+    words = f"High voltage up to {highest:g} V. Lid closed, interlock closed, nobody touching the specimen?"
+    said = yield from engine.ask(Question(words, expected=f"{highest:g}"))
+    engine.arming.confirm(highest, f"{said}")
+
+
+def choose_about_live_output(engine: Engine) -> Turns:
+    """A supply found live is reported and left alone; the operator may choose to have it taken down."""
+    guard = engine.guard
+    assert guard is not None
+    if guard.last is None or not (guard.last.voltage >= SAFE_VOLTAGE or HVFlag.ON in guard.last.flags):
+        return
+    found = f"hv: the output is live, measured {guard.last.voltage:.0f} V, though nobody switched it on from here."
+    engine.recorder.event("warning", "hv", found)
+    said = engine.take_down
+    if not said:
+        if engine.control.unattended:
+            return  # nobody can choose: the run ends with the output as it was found
+        said = yield from engine.ask(Question(f"{found} Nothing was changed. Ramp it down to zero?", "take down"))
+    limit = guard.ramp_duration * PATIENCE + GRACE_S
+    guard.take_down(f"found live; {said}")
+    yield from _until_off(engine, limit)
+
+
+def _take_down(engine: Engine, cause: str) -> Turns:
+    """Ramp the voltage down, latch, and yield until it has been measured off. The operator's word is used up."""
+    guard = engine.guard
+    if guard is None or guard.state is GuardState.SAFE:
+        return
+    limit = guard.ramp_duration * PATIENCE + GRACE_S
+    guard.ramp_off(cause)
+    engine.arming.withdraw()
+    yield from _until_off(engine, limit)
+
+
+def _until_off(engine: Engine, limit: float) -> Turns:
+    guard = engine.guard
+    assert guard is not None
+
+    def off() -> bool:
+        return guard.output_is_safe and guard.last is not None and HVFlag.ON not in guard.last.flags
+
+    yield from _wait(engine, off, limit, "The supply's way to zero")
+    assert guard.last is not None
+    engine.event("hv", f"off, measured {guard.last.voltage:.1f} V")
+
+
+def rest(engine: Engine, action: Action) -> Turns:
+    """The operator's pause: stage standing, voltage measured off, until he continues; then back to where ``action``
+    begins, with its voltage, so that it can be carried out anew."""
+    engine.stop_stage()
+    yield from _wait(engine, lambda: not engine.bench.stage.moving, GRACE_S, "The stage's standstill")
+    yield from _take_down(engine, "the operator's pause")
+    engine.control.say("Paused: the stage stands" + (", the voltage is off." if engine.guard is not None else "."))
+    while engine.control.pausing:
+        yield
+    engine.event("operator", "continues")
+    voltage, hv = action.voltage[0], engine.bench.scene.hv
+    if hv is not None and voltage > 0 and (action.voltage[1] > 0 or action.moves):
+        yield from _ramp_to(engine, voltage, voltage / hv.ramp_V_per_s * PATIENCE + GRACE_S)
+    if action.moves and action.kind != "return":
+        way = abs(action.h[0] - engine.recorder.displacement)
+        yield from _go(engine, action.h[0], action.speed, way / action.speed * PATIENCE + GRACE_S)
 
 
 def _return(engine: Engine, action: Action) -> Turns:
@@ -277,5 +364,6 @@ _BY_KIND: dict[str, Callable[[Engine, Action], Turns]] = {
     "zero": _zero,
     "approach": _approach,
     "hold": _hold,
+    "prompt": _prompt,
     "return": _return,
 }

@@ -26,7 +26,7 @@ class Commands(click.Group):
         except (click.ClickException, click.exceptions.Exit):
             raise
         except click.Abort:
-            click.echo("\nNot confirmed. Nothing was moved, no voltage was given, no log was written.", err=True)
+            click.echo("\nNot answered; nothing was changed.", err=True)
             ctx.exit(2)
         except KeyboardInterrupt:  # a run takes Ctrl-C itself; this is before it, after it, or another command
             click.echo("\nStopped by Ctrl-C. Nothing was being driven.", err=True)
@@ -96,30 +96,45 @@ def check(scene: Path, protocol: Path) -> None:
     type=click.Path(path_type=Path, dir_okay=False, allow_dash=True),
     help="Ports by role as `dea-rig sim` prints them; in place of the scene's.",
 )
-@click.option("--arm", is_flag=True, help="Allow high voltage on real ports; asks once more unless --yes.")
-@click.option("--yes", is_flag=True, help="Answer that question with yes: for unattended simulated benches.")
-def run(scene: Path, protocol: Path, out: Path, ports: Path | None, arm: bool, yes: bool) -> None:
-    """Run PROTOCOL on the bench of SCENE and log every byte. Ctrl-C ends it safely."""
-    from rig.errors import ConfigError
+@click.option("--arm", is_flag=True, help="Allow high voltage on real ports; the highest voltage is asked for too.")
+@click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
+@click.option("--take-down", is_flag=True, help="Ramp down an output that is found live; default: ask.")
+def run(scene: Path, protocol: Path, out: Path, ports: Path | None, arm: bool, yes: bool, take_down: bool) -> None:
+    """Run PROTOCOL on the bench of SCENE and log every byte. Ctrl-C ends it safely, Ctrl-Z or p pauses it."""
+    from rig.commands.run import run_and_tell
     from rig.experiment import prepare
-    from rig.experiment import run as run_experiment
     from rig.outputs import check_new
-    from rig.progress import progress
 
     check_new(out)
     experiment = prepare(scene, protocol, _read_ports(ports) if ports is not None else None)
-    if experiment.scene.on_real_ports and experiment.scene.hv is not None:
-        highest = max(max(action.voltage) for action in experiment.actions)
-        if highest > 0 and not arm:
-            raise ConfigError(f"This run goes up to {highest:g} V on a real port. If that is meant, add --arm.")
-        if highest > 0 and not yes:
-            click.confirm(
-                f"High voltage up to {highest:g} V. Lid closed, interlock closed, nobody touching the specimen?",
-                abort=True,
-            )
-    with progress(f"{experiment.scene.specimen.name}: {experiment.protocol.title}") as update:
-        outcome = run_experiment(experiment, out, update)
-    click.echo(f"{out}: {outcome.reason} after {outcome.duration:.0f} s; {outcome.state}.")
+    run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down)
+
+
+@main.command()
+@click.argument("log", required=False, type=FILE)
+def stop(log: Path | None) -> None:
+    """End the run that is going on, as Ctrl-C does; a second time hastens it. LOG names the run."""
+    from rig.commands.run import wish
+
+    wish("stop", log)
+
+
+@main.command()
+@click.argument("log", required=False, type=FILE)
+def pause(log: Path | None) -> None:
+    """Pause the run that is going on: the stage stops, the voltage ramps to zero. LOG names the run."""
+    from rig.commands.run import wish
+
+    wish("pause", log)
+
+
+@main.command("continue")
+@click.argument("log", required=False, type=FILE)
+def continue_(log: Path | None) -> None:
+    """Continue a paused run, or answer what a run asks. LOG names the run if there are several."""
+    from rig.commands.run import wish
+
+    wish("continue", log)
 
 
 @main.command()

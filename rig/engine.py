@@ -1,13 +1,14 @@
 """The engine: one single-threaded loop that polls the instruments, judges what they say and carries out the plan.
 
 Whatever ends a run, `rig.teardown` comes after it: the output goes off, the stage stops, and the log says by *measured*
-values in what state the rig was left. Signals only set a flag that ends the run or hastens the teardown.
+values in what state the rig was left. What the operator wants (`rig.control`) is looked at once a turn: a stop ends the
+run or hastens the teardown, a pause lets the voltage down and, once continued, begins the interrupted action anew.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -15,14 +16,15 @@ from typing import TYPE_CHECKING
 
 from drivers.link import DeviceError
 from drivers.roles import HVSample, Sample
-from rig.actions import carry_out
+from rig.actions import Turns, carry_out, choose_about_live_output, confirm_voltage, rest
 from rig.bench import Bench
+from rig.control import Control, Question
 from rig.errors import ConfigError, FaultError, LimitError, RigError, Stopped
 from rig.plan import Action
 from rig.recorder import Gains, Recorder
-from rig.safety.guard import Guard
+from rig.safety.arming import Arming
+from rig.safety.guard import Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
-from rig.signals import StopRequest
 from rig.teardown import Rest, Teardown
 from rig.watch import Watch
 
@@ -91,13 +93,17 @@ class Engine:
         Open; the engine writes rows, the caller attaches scene and protocol and finishes it.
     gains : Gains
         From the sensors' certificates.
-    stop : StopRequest
-        Set by signals; looked at once a turn.
+    control : Control
+        What the operator wants; looked at once a turn.
     progress : callable
         ``progress(done_s, total_s, label)`` about five times a second of the bench's time. Its errors end the
         display, not the run.
     certificates : mapping of str to Certificate
         By role, to be held against the serial numbers that the instruments state.
+    requested : str
+        How the operator asked for high voltage when he started the run; without it none is given.
+    take_down : str
+        How he chose, when he started the run, to have an output taken down that is found live; empty: he did not.
     """
 
     def __init__(
@@ -106,9 +112,11 @@ class Engine:
         actions: Sequence[Action],
         log: LogWriter,
         gains: Gains,
-        stop: StopRequest,
+        control: Control,
         progress: Callable[[float, float, str], None],
         certificates: Mapping[str, Certificate] | None = None,
+        requested: str = "",
+        take_down: str = "",
     ) -> None:
         self.bench = bench
         self.clock = bench.clock
@@ -118,11 +126,14 @@ class Engine:
         self.film = FilmLimits(bench.scene.specimen.specimen(), self.limits)
         self.force_noise = math.nan
         self.listener: Callable[[Sample], None] | None = None
+        self.control = control
+        self.arming = Arming(requested)
+        self.take_down = take_down
+        self.highest_voltage = max((level for action in actions for level in action.voltage), default=0.0)
         self._actions = actions
-        self._stop = stop
         self._progress = progress
         self._certificates = certificates or {}
-        self._guard: Guard | None = None
+        self.guard: Guard | None = None
         self._watch: Watch | None = None
         self._started = self.clock.now()
         self._next_progress = 0.0
@@ -144,8 +155,8 @@ class Engine:
         """Move the disk to displacement ``h`` metres, with the film checked along the way when there is HV."""
         self.limits.displacement.check(h, "Displacement set-point")
         voltage = 0.0
-        if self._guard is not None:
-            voltage = self._guard.setpoint
+        if self.guard is not None:
+            voltage = self.guard.setpoint
             self.film.check_path(self.recorder.displacement, h, voltage)
         self.recorder.target(h, voltage, speed)
         self.move_stage(self.recorder.contact + h, speed)
@@ -156,13 +167,35 @@ class Engine:
         self.bench.stage.stop()
 
     def request_voltage(self, volts: float) -> None:
-        """Ask the guard for a voltage at the displacement where the film is; the first time arms it."""
-        if self._guard is None:
+        """Ask the guard for a voltage at the displacement where the film is; a guard that is SAFE is armed for it."""
+        if self.guard is None:
             raise FaultError(f"{volts:g} V asked for, but the scene has no HV.")
-        if not self._guard.commanded:
-            self._guard.arm()
+        if self.guard.state is GuardState.SAFE:
+            self.arming.check(volts)
+            self.event("hv", f"armed by two acts: {self.arming.requested}; {self.arming.confirmed}")
+            self.guard.arm()
         self.recorder.target(self.recorder.displacement, volts, 0.0)
-        self._guard.request(volts, self.recorder.displacement)
+        self.guard.request(volts, self.recorder.displacement)
+
+    def event(self, source: str, message: str) -> None:
+        """Write to the log what a reader of it should know."""
+        self.recorder.event("info", source, message)
+
+    def ask(self, question: Question) -> Generator[None, None, str]:
+        """Ask the operator and yield until he has answered; question and answer go into the log.
+
+        Gives back who answered, and what, in words.
+        """
+        self.event("operator", f"asked: {question.text}")
+        self.control.put(question)
+        try:
+            while (answer := self.control.answer) is None:
+                yield
+        finally:
+            self.control.withdraw()
+        said = f"{answer.text!r}, by {answer.source}"
+        self.event("operator", f"answered: {said}")
+        return said
 
     # The run -------------------------------------------------------------------------------------------------
 
@@ -174,7 +207,9 @@ class Engine:
             self.bench.attach(self.recorder.wire)
             self._appoint_guard()
             self._set_up()
-            self._watch = Watch(self.bench, self.recorder, self.limits, self.film, self._guard)
+            self._watch = Watch(self.bench, self.recorder, self.limits, self.film, self.guard)
+            if self.highest_voltage > 0:
+                self._take_turns(confirm_voltage(self))
             self._carry_out_all()
         except Stopped as caught:
             status, error = "stopped", caught
@@ -187,7 +222,7 @@ class Engine:
             reason = str(error) if known else f"internal error: {error!r}"
             if self._doing:
                 error.add_note(f"It happened during {self._doing}.")
-        rest = Teardown(self.bench, self._guard, self.recorder, self._stop).run(
+        rest = Teardown(self.bench, self.guard, self.recorder, self.control).run(
             reason, status in ("complete", "stopped"), self._next_turn
         )
         for role, device in self.bench.devices.items():
@@ -201,7 +236,7 @@ class Engine:
         supply, table = self.bench.hv, self.bench.scene.hv
         if supply is None or table is None:
             return
-        self._guard = Guard(
+        self.guard = Guard(
             supply,
             self.limits,
             self.film,
@@ -252,39 +287,69 @@ class Engine:
 
     def _check_output(self) -> None:
         """High voltage must be measured off before anything moves: nobody stretches a film under unknown voltage."""
-        guard = self._guard
+        guard = self.guard
         if guard is None:
             return
         end = self.clock.now() + OUTPUT_LIMIT_S
         while not guard.output_is_safe and self.clock.now() < end:
             self._turn()
+        self._take_turns(choose_about_live_output(self))
         guard.check_off()
 
     def _carry_out_all(self) -> None:
         total = sum(action.duration for action in self._actions)
         done = 0.0
         for action in self._actions:
-            began = self.clock.now()
-            self.recorder.phase(
-                {
-                    "step": action.step,
-                    "kind": action.kind,
-                    "label": action.label,
-                    "cycle": action.cycle,
-                    "direction": action.direction,
-                    "voltage_V": action.voltage[1],
-                    "record": action.record,
-                }
-            )
-            label = self._doing = f"step {action.step} {action.kind}: {action.label}"
-            with closing(carry_out(self, action)) as turns:
-                for _ in turns:
-                    if self.clock.now() >= self._next_progress:
-                        self._next_progress = self.clock.now() + 0.2
-                        self._show(done + min(self.clock.now() - began, action.duration), total, label)
-                    self._turn()
+            while not self._carry_out(action, done, total):
+                self._pause(action, done, total)
             done += action.duration
-            self._show(done, total, label)
+            self._show(done, total, self._doing)
+
+    def _carry_out(self, action: Action, done: float, total: float) -> bool:
+        """Whether the action came to its end; False when the operator wants a pause."""
+        began = self.clock.now()
+        self._phase(action, action.kind, action.label, action.voltage[1], record=action.record)
+        label = self._doing = self.control.doing = f"step {action.step} {action.kind}: {action.label}"
+        with closing(carry_out(self, action)) as turns:
+            for _ in turns:
+                self._show_now_and_then(done + min(self.clock.now() - began, action.duration), total, label)
+                self._turn()
+                if self.control.pausing:
+                    return False
+        return True
+
+    def _pause(self, action: Action, done: float, total: float) -> None:
+        """Stage standing, voltage down; once the operator continues, back to where the action begins."""
+        self.event("operator", f"paused by {self.control.pausing} during {self._doing}")
+        self._phase(action, "pause", "the operator's pause", 0.0, record=False)
+        with closing(rest(self, action)) as turns:
+            for _ in turns:
+                self._show_now_and_then(done, total, f"paused: {self._doing}")
+                self._turn()
+
+    def _take_turns(self, turns: Turns) -> None:
+        with closing(turns):
+            for _ in turns:
+                self._turn()
+
+    def _phase(self, action: Action, kind: str, label: str, voltage: float, *, record: bool) -> None:
+        self.recorder.phase(
+            {
+                "step": action.step,
+                "kind": kind,
+                "label": label,
+                "cycle": action.cycle,
+                "direction": action.direction,
+                "voltage_V": voltage,
+                "record": record,
+            }
+        )
+
+    def _show_now_and_then(self, done: float, total: float, label: str) -> None:
+        if self.clock.now() >= self._next_progress:
+            self._next_progress = self.clock.now() + 0.2
+            question = self.control.question
+            self._show(done, total, f"waiting for you: {question.text}" if question is not None else label)
 
     def _show(self, done: float, total: float, label: str) -> None:
         """Show progress. A terminal that is gone must not end an experiment."""
@@ -296,9 +361,10 @@ class Engine:
 
     def _turn(self) -> None:
         """One turn of the loop: poll, judge, write, wait."""
-        if self._stop.count:
-            raise Stopped(f"stopped by {self._stop.source}")
         began = self.clock.now()
+        self.control.poll(began)
+        if self.control.count:
+            raise Stopped(f"stopped by {self.control.source}")
         for role in self.bench.devices:
             # Each device its own time: data must never seem to have come before they were sent.
             now = self.clock.now()
@@ -316,8 +382,8 @@ class Engine:
 
     def _take(self, role: str, sample: Sample, now: float) -> None:
         sample = self.recorder.add(sample)
-        if isinstance(sample, HVSample) and self._guard is not None:
-            self._guard.on_sample(sample)
+        if isinstance(sample, HVSample) and self.guard is not None:
+            self.guard.on_sample(sample)
         if self._watch is not None:
             self._watch.sample(role, sample, now)
         if self.listener is not None:

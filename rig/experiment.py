@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -13,6 +14,7 @@ from pathlib import Path
 from calibration.certificate import Certificate, CertificateError, load_certificate
 from rig.bench import Bench
 from rig.clock import Clock, calendar_now
+from rig.control import Control, Keyboard, Source
 from rig.engine import Engine, Outcome
 from rig.errors import ConfigError, FaultError
 from rig.log.writer import LogWriter
@@ -70,10 +72,30 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
     return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, check_plan(actions, scene))
 
 
-def run(experiment: Experiment, out: Path, progress: Callable[[float, float, str], None]) -> Outcome:
+@dataclass(frozen=True)
+class Consent:
+    """What the operator chose when he started the run, each in words for the log; empty where he did not.
+
+    ``arm``: high voltage is meant. ``answers``: questions are answered as expected, nobody is there. ``take_down``: an
+    output found live is to be ramped down.
+    """
+
+    arm: str = ""
+    answers: str = ""
+    take_down: str = ""
+
+
+def run(
+    experiment: Experiment,
+    out: Path,
+    progress: Callable[[float, float, str], None],
+    consent: Consent | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Outcome:
     """Carry the experiment out and leave a finished log at ``out``.
 
-    Returns the outcome of a run that ended as planned.
+    On the simulated bench in memory nobody is asked anything: every question is answered as expected, and the log says
+    so. Returns the outcome of a run that ended as planned.
 
     Raises
     ------
@@ -81,14 +103,31 @@ def run(experiment: Experiment, out: Path, progress: Callable[[float, float, str
         What ended the run early; the rig has been made safe and the log finished by then, and the error carries the
         outcome as a note.
     """
+    in_memory = not experiment.scene.on_real_ports
+    if consent is None:
+        consent = Consent(IN_MEMORY, IN_MEMORY) if in_memory else Consent()
     bench = Bench(experiment.scene)
     outcome: Outcome | None = None
     try:
         problems = _check_dates(experiment.certificates, bench.clock)
-        with LogWriter(out) as log, stop_on_signals() as stop:
+        with (
+            LogWriter(out) as log,
+            closing(Control([] if in_memory else _sources(out), consent.answers, say)) as control,
+            stop_on_signals(control, control.ask_pause),
+        ):
             _attach(log, experiment, problems)
             certificates = experiment.certificates
-            engine = Engine(bench, experiment.actions, log, _gains(certificates), stop, progress, certificates)
+            engine = Engine(
+                bench,
+                experiment.actions,
+                log,
+                _gains(certificates),
+                control,
+                progress,
+                certificates,
+                requested=consent.arm,
+                take_down=consent.take_down,
+            )
             outcome, error = engine.run()
             bench.close()  # before the log ends: closing a device may say a last word on its wire
             if not engine.recorder.log_failed:
@@ -105,6 +144,13 @@ def run(experiment: Experiment, out: Path, progress: Callable[[float, float, str
     finally:
         bench.close()
     return outcome
+
+
+def _sources(out: Path) -> list[Source]:
+    from rig.remote import Remote
+
+    keyboard = Keyboard.here()
+    return [Remote(out.resolve()), *([keyboard] if keyboard is not None else [])]
 
 
 def _certificates(scene: Scene, folder: Path) -> dict[str, Certificate]:

@@ -156,6 +156,10 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
             label = f"hold {h * 1e3:g} mm, {v:g} V"
             parameters = {"duration": step.duration_s}
             yield Action(number, kind, label, (h, h), (v, v), step.duration_s, record=contact, parameters=parameters)
+        elif isinstance(step, steps.Prompt):
+            if v > 0:
+                raise LimitError(f"Step {number} (prompt) comes with {v:g} V on; put the voltage to 0 first.")
+            yield Action(number, kind, step.text, (h, h), (0, 0), 0.0)
         elif isinstance(step, steps.Voltage):
             yield voltage_to(number, kind, step.voltage_V, step.settle_s)
             v = step.voltage_V

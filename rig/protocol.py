@@ -58,6 +58,13 @@ class Ramp(Table):
     speed_mm_per_s: Positive
 
 
+class Prompt(Table):
+    """Ask the operator to do something (mount the specimen, close the lid) and wait for his answer; voltage off."""
+
+    do: Literal["prompt"]
+    text: str = Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")
+
+
 class Hold(Table):
     """Stay where we are."""
 
@@ -94,7 +101,7 @@ class Return(Table):
 
 
 Step = Annotated[
-    Home | Zero | Approach | Precondition | Ramp | Hold | Voltage | Sweep | Return, Field(discriminator="do")
+    Home | Zero | Approach | Precondition | Ramp | Hold | Prompt | Voltage | Sweep | Return, Field(discriminator="do")
 ]
 
 

@@ -13,9 +13,9 @@ from functools import partial
 
 from drivers.roles import HVSample
 from rig.bench import Bench
+from rig.control import Control
 from rig.recorder import Recorder
 from rig.safety.guard import SAFE_VOLTAGE, Guard
-from rig.signals import StopRequest
 
 AT_ONCE_S = 5.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
 RAMP_PATIENCE, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
@@ -40,11 +40,11 @@ class Rest:
 class Teardown:
     """Makes one bench safe. ``guard`` is None when the scene has no HV, or its supply was never reached."""
 
-    def __init__(self, bench: Bench, guard: Guard | None, recorder: Recorder, stop: StopRequest) -> None:
+    def __init__(self, bench: Bench, guard: Guard | None, recorder: Recorder, control: Control) -> None:
         self._bench = bench
         self._guard = guard
         self._recorder = recorder
-        self._stop = stop
+        self._control = control
         self._told: set[str] = set()
         self._failed: set[str] = set()  # roles that did not answer when last asked
         self._again = dict.fromkeys(bench.devices, -math.inf)
@@ -64,7 +64,8 @@ class Teardown:
         self._stop_stage()
         while self._bench.devices:
             now = clock.now()
-            if commanded and not hastened and (self._stop.count >= 2 or "hv" in self._failed or now >= end):
+            self._control.poll(now)
+            if commanded and not hastened and (self._control.count >= 2 or "hv" in self._failed or now >= end):
                 hastened, end = True, now + AT_ONCE_S
                 self._off(f"{cause}; hastened", at_once=True)
             for role in sorted(self._bench.devices, key=lambda role: role != "hv"):

@@ -122,6 +122,7 @@ _TAGS = {
     "precondition",
     "ramp",
     "hold",
+    "prompt",
     "sweep",
     "voltage",
     "return",

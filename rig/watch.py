@@ -11,7 +11,7 @@ from drivers.roles import DisplacementSample, ForceSample, HVFlag, HVSample, Sam
 from rig.bench import Bench
 from rig.errors import FaultError
 from rig.recorder import Recorder
-from rig.safety.guard import SAFE_VOLTAGE, Guard, flag_names
+from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState, flag_names
 from rig.safety.limits import FilmLimits, Limits
 
 SILENCE_PERIODS = 10.0  # a sensor silent for this many periods, and longer than two of its time-outs, is a fault
@@ -44,6 +44,7 @@ class Watch:
         self._equal_forces = 0
         self._agreed = -math.inf
         self._next_film_check = 0.0
+        self._seen_off = False
 
     def sample(self, role: str, sample: Sample, now: float) -> None:
         """Judge one sample, as the recorder gave it back."""
@@ -99,13 +100,19 @@ class Watch:
             limit.widened(1 + ZERO_PART).check(recorder.unzeroed(sample), "Force measured, before its zero")
 
     def _judge_output(self, sample: HVSample) -> None:
-        """A supply that nobody has armed must stay off."""
+        """A supply whose guard is SAFE must stay off, once it has been measured off."""
         guard = self._guard
-        live = sample.voltage >= SAFE_VOLTAGE or HVFlag.ON in sample.flags
-        if guard is not None and not guard.commanded and live:
+        if guard is None:
+            return
+        on = HVFlag.ON in sample.flags
+        if guard.state is not GuardState.SAFE:
+            self._seen_off = False
+        elif guard.output_is_safe and not on:
+            self._seen_off = True
+        elif self._seen_off and (sample.voltage >= SAFE_VOLTAGE or on):
             raise FaultError(
-                f"hv: the output is live ({sample.voltage:.0f} V) though nobody switched it on from here. Nothing was "
-                "changed. Find out who did; take it down by hand; start again."
+                f"hv: the output is live ({sample.voltage:.0f} V) though nobody switched it on from here. "
+                "Find out who did; take it down by hand; start again."
             )
 
     def _compare_stage_and_laser(self, now: float) -> None:

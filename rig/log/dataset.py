@@ -203,7 +203,7 @@ def load_run(path: Path, latency: Mapping[str, float] | None = None) -> Run:
     times = {topic: tables[topic]["t_s"] - late.pop(topic.split("/")[1], 0.0) for topic in _TOPICS}
     if late:
         raise ValueError(f"latency of {', '.join(late)}; roles are force, displacement, stage, hv")
-    phases = [Phase(*row) for row in _rows_by_time(tables["/phase"])]
+    phases = _without_interrupted([Phase(*row) for row in _rows_by_time(tables["/phase"])])
     references = [Reference(*row) for row in _rows_by_time(tables["/reference"])]
 
     force = tables["/force/sample"]
@@ -227,6 +227,15 @@ def load_run(path: Path, latency: Mapping[str, float] | None = None) -> Run:
         references=references,
         force_per_reading=_gain(newton, reading - _newest(t, references, "force_zero")),
     )
+
+
+def _without_interrupted(phases: list[Phase]) -> list[Phase]:
+    """What the operator's pause interrupted was done again afterwards; its first part is no data of the film."""
+    followers = [*(phase.kind for phase in phases[1:]), ""]
+    return [
+        phase._replace(record=False) if follower == "pause" else phase
+        for phase, follower in zip(phases, followers, strict=True)
+    ]
 
 
 def interpolate(t: Floats, sample_t: Floats, values: Floats) -> Floats:

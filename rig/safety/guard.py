@@ -123,6 +123,16 @@ class Guard:
         if HVFlag.ON in self.last.flags:
             raise FaultError("hv: cannot be used, the channel is on already. Nothing was changed. Switch it off first.")
 
+    def take_down(self, cause: str) -> None:
+        """Ramp down and switch off an output that was found live, by the operator's choice; the latch stays SAFE."""
+        self.commanded = True
+        self._low_samples = 0
+        try:
+            self._tell("take_down", cause)
+        finally:
+            self._supply.set_ramp(self._ramp)
+            self._supply.switch_off()
+
     def request(self, volts: float, h: float) -> None:
         """Ramp the output to ``volts`` with the disk at displacement ``h`` metres.
 

@@ -13,6 +13,7 @@ import pytest
 from calibration.certificate import load_certificate
 from drivers.link import DeviceError
 from rig.bench import Bench
+from rig.control import Control
 from rig.engine import Engine, Outcome
 from rig.errors import RigError
 from rig.log.reader import read_log
@@ -21,7 +22,6 @@ from rig.plan import check_plan, plan
 from rig.protocol import Protocol
 from rig.recorder import Gains
 from rig.scene import Scene
-from rig.signals import StopRequest
 from rig.sim.bench import SimulatedBench
 from rig.toml_file import parse_table
 
@@ -89,7 +89,7 @@ class Story:
         return [m.fields["command"] for m in read_log(self.log).messages("/command") if m.fields["device"] == "hv"]
 
 
-Mischief = Callable[[SimulatedBench, StopRequest], None]
+Mischief = Callable[[SimulatedBench, Control], None]
 Tell = Callable[..., Story]
 
 
@@ -116,7 +116,7 @@ def tell(tmp_path: Path) -> Tell:
         gains = Gains(force=certificate.gain, force_unit=certificate.reading_unit)
         bench = Bench(parsed)
         assert bench.simulated is not None
-        simulated, clock, stop = bench.simulated, bench.clock, StopRequest()
+        simulated, clock, stop = bench.simulated, bench.clock, Control(unattended="a test")
         outputs: list[tuple[float, float]] = []
         done_at: list[float] = []
 
@@ -131,7 +131,7 @@ def tell(tmp_path: Path) -> Tell:
 
         path = tmp_path / "run.mcap"
         with LogWriter(path) as log:
-            engine = Engine(bench, actions, log, gains, stop, progress, {"force": certificate})
+            engine = Engine(bench, actions, log, gains, stop, progress, {"force": certificate}, requested="a test")
             outcome, error = engine.run()
             bench.close()
             if not engine.recorder.log_failed:

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from drivers.link import DeviceError, DeviceLost
+from rig.control import Control
 from rig.errors import FaultError, LimitError
 from rig.log.reader import read_log
-from rig.signals import StopRequest
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault
 
@@ -24,7 +24,7 @@ def tell_other(tell: Tell) -> Tell:
     return partial(tell, scene="other-instruments")
 
 
-def inject(role: str, kind: str, **more: Any) -> Callable[[SimulatedBench, StopRequest], None]:
+def inject(role: str, kind: str, **more: Any) -> Callable[[SimulatedBench, Control], None]:
     return lambda bench, stop: bench.inject(Fault(role=role, kind=kind, **more))
 
 
@@ -85,7 +85,7 @@ def watch_targets(bench: SimulatedBench, targets: list[float]) -> None:
 def test_lines_doubled_torn_and_late_change_nothing(tell_other: Tell) -> None:
     targets: list[float] = []
 
-    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+    def mischief(bench: SimulatedBench, stop: Control) -> None:
         watch_targets(bench, targets)
         for kind in ("duplicate", "split", "delay"):
             bench.inject(Fault(role="hv", kind=kind, value=0.02, probability=0.2))
@@ -101,7 +101,7 @@ def test_damaged_answers_never_raise_the_voltage(tell_other: Tell, seed: int) ->
     """There is no checksum: whatever a damaged digit says, it must not become a set-point."""
     targets: list[float] = []
 
-    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+    def mischief(bench: SimulatedBench, stop: Control) -> None:
         watch_targets(bench, targets)
         bench.inject(Fault(role="hv", kind="corrupt", probability=0.1))
         stop.ask("a test")  # so that the ramp down is what meets the damage
@@ -120,7 +120,7 @@ def test_a_supply_found_live_is_reported_and_left_alone(tell_other: Tell) -> Non
 
 @pytest.mark.parametrize("scene", ["cone-4mm", "other-instruments"])
 def test_an_error_during_the_ramp_down_does_not_keep_the_emergency_off_from_being_sent(tell: Tell, scene: str) -> None:
-    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+    def mischief(bench: SimulatedBench, stop: Control) -> None:
         stop.ask("a test")
         bench.inject(Fault(role="hv", kind="silent", at_s=bench.now + 0.5))
 

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from drivers.link import DeviceError, DeviceLost
+from rig.control import Control
 from rig.errors import ConfigError, FaultError, LimitError, Stopped
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
-from rig.signals import StopRequest
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault
 
@@ -21,7 +21,7 @@ RAMP_DOWN_S = 1000 / 300 + 1.0  # from 1000 V at the scene's 300 V/s, and a seco
 AT_ONCE_S = 1.5
 
 
-def inject(role: str, kind: str, **more: Any) -> Callable[[SimulatedBench, StopRequest], None]:
+def inject(role: str, kind: str, **more: Any) -> Callable[[SimulatedBench, Control], None]:
     return lambda bench, stop: bench.inject(Fault(role=role, kind=kind, **more))
 
 
@@ -44,7 +44,7 @@ def test_a_stop_ramps_down(tell: Tell) -> None:
 
 
 def test_a_second_stop_takes_the_output_off_at_once(tell: Tell) -> None:
-    def twice(bench: SimulatedBench, stop: StopRequest) -> None:
+    def twice(bench: SimulatedBench, stop: Control) -> None:
         stop.ask("a test")
         stop.ask("a test")
 
@@ -104,7 +104,7 @@ def test_a_supply_found_live_is_reported_and_left_alone(tell: Tell) -> None:
 
 
 def test_a_supply_that_does_not_hear_the_first_off_is_told_again(tell: Tell) -> None:
-    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+    def mischief(bench: SimulatedBench, stop: Control) -> None:
         bench.inject(Fault(role="hv", kind="silent", duration_s=1.0, direction="both"))
         stop.ask("a test")
 
@@ -140,7 +140,7 @@ def test_a_slow_ramp_down_is_left_its_time(tell: Tell) -> None:
 
 
 def test_progress_that_cannot_be_shown_does_not_end_the_run(tell: Tell) -> None:
-    def gone(bench: SimulatedBench, stop: StopRequest) -> None:
+    def gone(bench: SimulatedBench, stop: Control) -> None:
         raise BrokenPipeError(32, "Broken pipe")
 
     story = tell(gone)
@@ -174,7 +174,7 @@ def test_a_certificate_of_another_sensor_is_told_in_the_log(tell: Tell) -> None:
 def test_a_log_that_fails_on_the_way_to_the_safe_state_stops_nothing(
     tell: Tell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def mischief(bench: SimulatedBench, stop: StopRequest) -> None:
+    def mischief(bench: SimulatedBench, stop: Control) -> None:
         def full(self: LogWriter, *arguments: object) -> None:
             raise LogError(self.path, "writing failed (No space left on device)")
 
@@ -188,7 +188,7 @@ def test_a_log_that_fails_on_the_way_to_the_safe_state_stops_nothing(
 
 
 def test_a_log_that_cannot_be_written_ends_the_run(tell: Tell, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fill_the_disk(bench: SimulatedBench, stop: StopRequest) -> None:
+    def fill_the_disk(bench: SimulatedBench, stop: Control) -> None:
         def full(self: LogWriter, data: bytes) -> None:
             raise LogError(self.path, "writing failed (No space left on device)")
 

@@ -18,6 +18,7 @@ from calibration.certificate import load_certificate
 from drivers.link import DeviceError
 from model.membrane import solve_many
 from rig.bench import Bench
+from rig.control import Control
 from rig.engine import Engine, Outcome
 from rig.errors import ConfigError, RigError, Stopped
 from rig.experiment import prepare
@@ -27,7 +28,6 @@ from rig.log.export import export
 from rig.log.info import info
 from rig.log.writer import LogWriter
 from rig.recorder import Gains
-from rig.signals import StopRequest
 from rig.sim.bench import SimulatedBench
 
 FIXTURES = Path(str(files("sim_fixtures")))
@@ -73,11 +73,11 @@ class Story:
     final_output: float
 
 
-def tell(folder: Path, *, mischief: Callable[[StopRequest], None] | None = None, gains: Gains | None = None) -> Story:
+def tell(folder: Path, *, mischief: Callable[[Control], None] | None = None, gains: Gains | None = None) -> Story:
     protocol, path = folder / "protocol.toml", folder / "run.mcap"
     protocol.write_text(PROTOCOL)
     experiment = prepare(SCENE, protocol)
-    bench, stop = Bench(experiment.scene), StopRequest()
+    bench, stop = Bench(experiment.scene), Control(unattended="a test")
     simulated, clock = bench.simulated, bench.clock
     assert simulated is not None
     outputs = [0.0]
@@ -90,7 +90,7 @@ def tell(folder: Path, *, mischief: Callable[[StopRequest], None] | None = None,
     certificate = experiment.certificates["force"]
     gains = gains or Gains(force=certificate.gain, force_unit=certificate.reading_unit)
     with LogWriter(path) as log:
-        outcome, error = Engine(bench, experiment.actions, log, gains, stop, progress).run()
+        outcome, error = Engine(bench, experiment.actions, log, gains, stop, progress, requested="a test").run()
         bench.close()
         log.finish(outcome.as_text())
     final = simulated.world.output.at(clock.now())[0]

@@ -1,0 +1,1 @@
+"""What stands behind commands that are more than a few lines."""
