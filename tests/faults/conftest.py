@@ -90,6 +90,7 @@ class Story:
 
 
 Mischief = Callable[[SimulatedBench, Control], None]
+Meanwhile = Callable[[float, SimulatedBench, Control], None]
 Tell = Callable[..., Story]
 
 
@@ -98,31 +99,41 @@ def tell(tmp_path: Path) -> Tell:
     """``tell(mischief, replace, scene)`` runs the short protocol on the simulated bench.
 
     ``mischief(bench, stop)`` is called once, with 1000 V on and the stage moving. ``replace`` is (old, new) in the
-    text of the scene, which is named as among the fixtures. The story tells the supply's true output about five times
-    a second.
+    text of the scene, which is named as among the fixtures. ``meanwhile(now, bench, control)`` is called about five
+    times a second of the run, and as often the story tells the supply's true output.
     """
 
     def run(
-        mischief: Mischief | None = None, *, replace: tuple[str, str] | None = None, scene: str = "cone-4mm"
+        mischief: Mischief | None = None,
+        *,
+        replace: tuple[str, str] | None = None,
+        scene: str = "cone-4mm",
+        meanwhile: Meanwhile | None = None,
+        protocol: str = PROTOCOL,
+        control: Control | None = None,
+        requested: str = "a test",
+        take_down: str = "",
     ) -> Story:
         text = (SCENES / f"{scene}.toml").read_text()
         if replace is not None:
             assert replace[0] in text
             text = text.replace(*replace)
         parsed = parse_table(text, Scene, "scene", "test")
-        actions = plan(parse_table(PROTOCOL, Protocol, "protocol", "test"), parsed)
+        actions = plan(parse_table(protocol, Protocol, "protocol", "test"), parsed)
         check_plan(actions, parsed)
         certificate = load_certificate(SCENES / parsed.force.certificate)
         gains = Gains(force=certificate.gain, force_unit=certificate.reading_unit)
         bench = Bench(parsed)
         assert bench.simulated is not None
-        simulated, clock, stop = bench.simulated, bench.clock, Control(unattended="a test")
+        simulated, clock, stop = bench.simulated, bench.clock, control or Control(unattended="a test")
         outputs: list[tuple[float, float]] = []
         done_at: list[float] = []
 
         def progress(done: float, total: float, label: str) -> None:
             now = clock.now()
             outputs.append((now, float(simulated.world.voltage(np.array([now]))[0])))
+            if meanwhile is not None:
+                meanwhile(now, simulated, stop)
             if mischief is not None and "ramp: 0 to 6 mm" in label and not done_at:
                 moving = simulated.world.stage.end > now
                 if moving:
@@ -131,7 +142,7 @@ def tell(tmp_path: Path) -> Tell:
 
         path = tmp_path / "run.mcap"
         with LogWriter(path) as log:
-            engine = Engine(bench, actions, log, gains, stop, progress, {"force": certificate}, requested="a test")
+            engine = Engine(bench, actions, log, gains, stop, progress, {"force": certificate}, requested, take_down)
             outcome, error = engine.run()
             bench.close()
             if not engine.recorder.log_failed:

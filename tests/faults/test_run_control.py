@@ -1,0 +1,214 @@
+"""What the operator does to a run while it goes on, and what the simulated hardware then did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from rig.control import Control
+from rig.errors import FaultError, Stopped
+from rig.log.dataset import load_run
+from rig.log.reader import read_log
+from rig.sim.bench import SimulatedBench
+
+Tell = Callable[..., Any]  # of conftest.Story
+LIVE = ("[simulation.hv]", "[simulation.hv]\nstart_live_V = 500.0")
+ASKING = """
+[[step]]
+do = "home"
+[[step]]
+do = "zero"
+duration_s = 0.5
+[[step]]
+do = "approach"
+speed_mm_per_s = 4.0
+threshold_mN = 8.0
+[[step]]
+do = "prompt"
+text = "Close the lid"
+[[step]]
+do = "voltage"
+voltage_V = 500
+settle_s = 0.2
+[[step]]
+do = "voltage"
+voltage_V = 0
+[[step]]
+do = "prompt"
+text = "Look at the film"
+[[step]]
+do = "voltage"
+voltage_V = 300
+[[step]]
+do = "return"
+"""
+
+
+class Operator:
+    """Types what ``script`` says; called with the control and told nothing else, like a person at a keyboard."""
+
+    name = "a person"
+
+    def __init__(self, script: Callable[[Control], list[str]]) -> None:
+        self._script = script
+
+    def read(self, control: Control) -> list[str]:
+        return self._script(control)
+
+    def close(self) -> None: ...
+
+
+def answers(control: Control) -> list[str]:
+    """Whatever is asked, as expected."""
+    question = control.question
+    return [question.expected or "done"] if question is not None and control.answer is None else []
+
+
+def said_in(story: Any, words: str) -> list[str]:
+    messages = [message.fields["message"] for message in read_log(story.log).messages("/event")]
+    return [message for message in messages if words in message]
+
+
+def commands(story: Any) -> list[str]:
+    """What was commanded of the supply and asked of the operator, in the order of time."""
+    log = read_log(story.log)
+    told = [(m.fields["t_s"], m.fields["command"]) for m in log.messages("/command") if m.fields["device"] == "hv"]
+    asked = [(m.fields["t_s"], m.fields["message"][:5]) for m in log.messages("/event")]
+    return [word for _, word in sorted(told + [(t, word) for t, word in asked if word == "asked"], key=lambda x: x[0])]
+
+
+def test_a_pause_stops_the_stage_takes_the_voltage_off_and_the_interrupted_part_is_done_again(tell: Tell) -> None:
+    paused_at: list[float] = []
+    during: list[tuple[float, float]] = []  # the output and the stage's speed, more than 5 s into the pause
+
+    def meanwhile(now: float, bench: SimulatedBench, control: Control) -> None:
+        if control.pausing and now > paused_at[0] + 5.0:
+            during.append((bench.world.output.at(now)[0], bench.world.stage.at(now)[1]))
+            if now > paused_at[0] + 8.0:
+                control.take("continue", "a test")
+
+    def pause(bench: SimulatedBench, control: Control) -> None:
+        paused_at.append(bench.now)
+        control.take("pause", "a test")
+
+    story = tell(pause, meanwhile=meanwhile)
+    assert story.outcome.status == "complete" and story.outcome.safe, story.outcome.reason
+    assert len(during) > 5 and all(abs(volts) < 1 and speed == 0 for volts, speed in during)
+    at_1000 = [t for t, volts in story.outputs if volts > 990]
+    assert at_1000[0] < paused_at[0] < paused_at[0] + 8 < at_1000[-1]
+    assert commands(story).count("arm") == 2 and commands(story).count("asked") == 2  # the second key is used up
+    assert "emergency_off" not in story.control_words
+    run = load_run(story.log)
+    kinds = [(phase.kind, phase.record) for phase in run.phases]
+    at = kinds.index(("pause", False))
+    assert kinds[at - 1] == ("ramp", False) and kinds[at + 1] == ("ramp", True)
+    again = run.h[run.phase == at + 1]
+    assert again.min() < 0.1e-3 and again.max() > 5.9e-3  # the whole ramp, from its beginning
+
+
+def test_a_stop_during_a_pause_ends_the_run(tell: Tell) -> None:
+    def meanwhile(now: float, bench: SimulatedBench, control: Control) -> None:
+        if control.pausing and bench.world.output.at(now)[0] < 1:
+            control.take("stop", "a test")
+
+    story = tell(lambda bench, control: control.take("p", "a test"), meanwhile=meanwhile)
+    assert isinstance(story.error, Stopped) and story.outcome.safe and story.outcome.standing
+
+
+def test_nothing_is_armed_before_the_highest_voltage_has_been_typed(tell: Tell) -> None:
+    typed: list[str] = []
+
+    def script(control: Control) -> list[str]:
+        wrong = ["yes", "100", "1000 V", "", "continue"]
+        if control.question is None or control.answer is not None or len(typed) > len(wrong):
+            return []
+        typed.append([*wrong, "1000"][len(typed)])
+        return [typed[-1]]
+
+    story = tell(control=Control([Operator(script)]))
+    assert typed[-1] == "1000" and len(typed) == 6
+    assert story.outcome.status == "complete" and max(volts for _, volts in story.outputs) > 990
+    assert said_in(story, "armed by two acts: a test; '1000', by a person")
+
+
+def test_without_the_first_act_the_second_does_not_help(tell: Tell) -> None:
+    story = tell(requested="")
+    assert isinstance(story.error, FaultError) and "was not asked for by the operator" in str(story.error)
+    assert not story.control_words and max(volts for _, volts in story.outputs) < 1.0
+
+
+def test_prompts_are_asked_with_the_voltage_off_and_arming_begins_anew(tell: Tell) -> None:
+    asked: list[str] = []
+
+    def script(control: Control) -> list[str]:
+        if control.question is not None and control.answer is None:
+            asked.append(control.question.text)
+        return answers(control)
+
+    outputs_when_asked: list[float] = []
+
+    def meanwhile(now: float, bench: SimulatedBench, control: Control) -> None:
+        if control.question is not None and "lid" not in control.question.text:
+            outputs_when_asked.append(bench.world.output.at(now)[0])
+
+    story = tell(control=Control([Operator(script)]), protocol=ASKING, meanwhile=meanwhile)
+    assert story.outcome.status == "complete", story.outcome.reason
+    texts = asked
+    assert texts[1:3] == ["Close the lid", "Look at the film"]
+    assert texts[0].startswith("High voltage up to 500 V") and texts[3].startswith("High voltage up to 500 V")
+    assert all(abs(volts) < 1 for volts in outputs_when_asked)
+    assert commands(story) == [
+        *["asked", "asked", "arm", "set_voltage", "switch_on", "set_voltage", "switch_off"],
+        *["asked", "asked", "arm", "set_voltage", "switch_on", "set_voltage", "switch_off"],
+    ]
+    assert len(said_in(story, "answered: 'done', by a person")) == 2
+
+
+def test_the_loop_goes_on_while_the_operator_is_waited_for(tell: Tell) -> None:
+    """A load cell lost while a question is open ends the run, though nobody has answered."""
+    from rig.sim.settings import Fault
+
+    def meanwhile(now: float, bench: SimulatedBench, control: Control) -> None:
+        if control.question is not None and "Look" in control.question.text and not lost:
+            lost.append(now)
+            bench.inject(Fault(role="force", kind="vanish"))
+
+    lost: list[float] = []
+
+    def script(control: Control) -> list[str]:
+        return [] if control.question is not None and "Look" in control.question.text else answers(control)
+
+    story = tell(control=Control([Operator(script)]), protocol=ASKING, meanwhile=meanwhile)
+    assert lost and story.outcome.status == "fault" and "force" in story.outcome.reason
+    assert story.end - lost[0] < 2.0 and story.outcome.safe
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_a_supply_found_live_is_taken_down_when_the_operator_chooses(tell: Tell, asked: bool) -> None:
+    seen: list[str] = []
+
+    def script(control: Control) -> list[str]:
+        if control.question is not None:
+            seen.append(control.question.text)
+        return answers(control)
+
+    choice = {} if asked else {"take_down": "--take-down on the command line"}
+    story = tell(control=Control([Operator(script)]), replace=LIVE, **choice)
+    assert any("live, measured 500 V" in text for text in seen) is asked
+    assert story.outcome.status == "complete" and abs(story.final_output) < 1, story.outcome.reason
+    assert story.control_words[:2] == ["take_down", "arm"]
+
+
+def test_a_supply_found_live_is_left_alone_while_the_operator_thinks_and_when_he_stops(tell: Tell) -> None:
+    looked: list[float] = []
+
+    def script(control: Control) -> list[str]:
+        if control.question is not None and "live" in control.question.text:
+            looked.append(1.0)
+        return ["s"] if len(looked) > 200 else []  # ten seconds
+
+    story = tell(control=Control([Operator(script)]), replace=LIVE)
+    assert isinstance(story.error, Stopped) and not story.outcome.safe
+    assert story.final_output == pytest.approx(500, abs=5) and not story.control_words and not story.stage_words[:-1]
