@@ -7,6 +7,7 @@ when the owner calls ``read`` or ``write``.
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections import deque
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
@@ -40,6 +41,7 @@ _ADVICE = {
     "udp_multicast": "It needs the package msgpack (extra `multicast`), and a multicast address such as 239.74.163.2.",
 }
 
+_NOWHERE = logging.NullHandler()
 _BUS_OFF = 0x40  # SocketCAN's error class CAN_ERR_BUSOFF in the identifier of an error frame
 _MOST_LOOKS = 4096  # in one read: some 4 s of a full 125 kbit/s bus
 _SEND_TIMEOUT_S = 0.05
@@ -100,6 +102,7 @@ class CanLink:
             )
         import can
 
+        _quiet()
         options = _OPTIONS.get(interface, {}) | options
         if interface not in _WITHOUT_BITRATE:
             options["bitrate"] = bitrate
@@ -237,6 +240,20 @@ class CanLink:
             return bool(port.in_waiting)
         except Exception as error:
             raise self._lost(f"the CAN channel is gone ({error})") from error
+
+
+def channels() -> list[tuple[str, str]]:
+    """(interface, channel) of the CAN channels that this machine's system and installed adapter drivers can name."""
+    import can
+
+    _quiet()
+    found = can.detect_available_configs(["socketcan", "pcan", "vector"])
+    return sorted({(str(one["interface"]), str(one["channel"])) for one in found})
+
+
+def _quiet() -> None:
+    """Keep python-can from telling the terminal which adapters' drivers are missing; our errors say what matters."""
+    logging.getLogger("can").addHandler(_NOWHERE)
 
 
 def _serial_port(bus: can.BusABC) -> Any:

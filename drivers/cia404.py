@@ -135,6 +135,16 @@ def autozero_request(node: int, channel: int) -> CanFrame:
     return CanFrame(0x600 + node, struct.pack("<BHB4s", 0x22, AUTOZERO, channel, b"zero"))
 
 
+def identity(vendor: int | None, product: int | None, revision: int | None, serial: int | None) -> Identity:
+    """From object 1018h:1 to 4; None where the node does not say."""
+    return Identity(
+        model="CiA 404"
+        + (f" vendor {vendor:X} product {product:X}" if vendor is not None and product is not None else ""),
+        serial="" if serial is None else str(serial),
+        firmware="" if revision is None else f"{revision >> 16}.{revision & 0xFFFF}",
+    )
+
+
 class Decoder:
     """Frames of one node to messages. Never raises.
 
@@ -499,15 +509,11 @@ class CiA404:
                 f"node {self._node} is no CiA 404 device ({stated})",
                 "Correct the node number in the scene.",
             )
-        identity = []
+        identifying: list[int | None] = []
         for sub in range(1, 5):
-            identity.append((yield from self._read(0x1018, sub, 4)))
-        vendor, product, revision, serial = ("" if isinstance(i, Aborted) else i for i in identity)
-        self.identity = Identity(
-            model=f"CiA 404 vendor {vendor:X} product {product:X}" if vendor != "" and product != "" else "CiA 404",
-            serial=str(serial),
-            firmware=f"{revision >> 16}.{revision & 0xFFFF}" if isinstance(revision, int) else "",
-        )
+            answer = yield from self._read(0x1018, sub, 4)
+            identifying.append(None if isinstance(answer, Aborted) else answer)
+        self.identity = identity(*identifying)
         self._layout = yield from self._map()
         yield from self._read_unit()
         yield from self._set_timer()

@@ -241,6 +241,16 @@ class Decoder:
         return Measured(frame_type, values, bool(status & 1), bool(status & 2))
 
 
+def identity(serial: bytes, firmware: bytes) -> Identity:
+    """From the data of GetSerialNo and GetFirmwareVersion; empty bytes where the amplifier did not say."""
+    pair = f"{int.from_bytes(firmware[:2], 'big')}.{int.from_bytes(firmware[2:], 'big')}"
+    return Identity(
+        model="GSV-8",
+        serial=str(int.from_bytes(serial, "big")) if serial else "",
+        firmware=pair if len(firmware) == 4 else firmware.hex(),
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class _Request:
     command: int
@@ -474,10 +484,8 @@ class GSV8:
         yield from self._demand(STOP_TRANSMISSION)
         serial = yield from self._ask(GET_SERIAL_NUMBER, lengths=(4,), delay_s=_QUIET_S)
         firmware = yield from self._ask(GET_FIRMWARE_VERSION, lengths=())
-        self.identity = Identity(
-            model="GSV-8",
-            serial=str(int.from_bytes(serial.data, "big")) if serial.error <= 1 else "",
-            firmware=_firmware(firmware.data) if firmware.error <= 1 else "",
+        self.identity = identity(
+            serial.data if serial.error <= 1 else b"", firmware.data if firmware.error <= 1 else b""
         )
         yield from self._read_scaling(channel)
         yield from self._demand(SET_TX_MODE, struct.pack(">BH", 1, _TX_MODE[self._frame_type]))
@@ -579,9 +587,3 @@ class _Recogniser:
         if self._request.command == GET_VALUE:
             return False
         return not self._request.answer_lengths or len(message.data) in self._request.answer_lengths
-
-
-def _firmware(data: bytes) -> str:
-    if len(data) == 4:
-        return f"{int.from_bytes(data[:2], 'big')}.{int.from_bytes(data[2:], 'big')}"
-    return data.hex()

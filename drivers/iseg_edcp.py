@@ -250,6 +250,16 @@ def log_off(module: int) -> CanFrame:
     return CanFrame(_id(module, 0), b"\xd8\x00")
 
 
+def identity(serial: Value | None, release: Value | None, name: Value | None) -> Identity:
+    """From the items serial number, firmware release and firmware name; None where the module does not say."""
+    text = "".join(chr(b) for b in name if 0x20 < b < 0x7F) if isinstance(name, bytes) else ""
+    return Identity(
+        model=f"iseg {text}" if text else "iseg EDCP",
+        serial=f"{serial:d}" if isinstance(serial, int) else "",
+        firmware=".".join(str(b) for b in release.to_bytes(4, "big")) if isinstance(release, int) else "",
+    )
+
+
 class Decoder:
     """Frames of one module to messages. Never raises.
 
@@ -655,11 +665,7 @@ class IsegEDCP:
                 f"module {self._module} has {channels} channel(s), but channel {self._channel} was asked for",
                 f"Channels count from 0: allowed is 0 to {channels - 1}.",
             )
-        self.identity = Identity(
-            model="iseg " + _text(firmware) if isinstance(firmware, bytes) else "iseg EDCP",
-            serial=f"{serial:d}" if isinstance(serial, int) else "",
-            firmware=_release(release) if isinstance(release, int) else "",
-        )
+        self.identity = identity(serial, release, firmware)
         volts, _ = yield from self._number(NOMINAL_VOLTAGE, 1e6)
         amperes, _ = yield from self._number(NOMINAL_CURRENT, 1e3)
         if not (volts > 0 and amperes > 0):
@@ -813,12 +819,3 @@ def _value(answer: Answer[Message]) -> Value:
 
 def _names(flags: IntFlag) -> str:
     return " ".join(str(flag.name) for flag in flags)
-
-
-def _text(raw: bytes) -> str:
-    """Device text with anything but printable ASCII taken out."""
-    return "".join(chr(b) for b in raw if 0x20 < b < 0x7F)
-
-
-def _release(value: int) -> str:
-    return ".".join(str(b) for b in value.to_bytes(4, "big"))

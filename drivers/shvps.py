@@ -54,6 +54,17 @@ def encode(command: str) -> bytes:
     return command.encode("ascii") + b"\r"
 
 
+def version_of(line: str) -> tuple[str, str]:
+    """(kind of board, firmware) from the answer to ``QVer``; ("", "") when it is none."""
+    match = _VERSION.fullmatch(line)
+    return (match[1], match[2]) if match else ("", "")
+
+
+def identity(name: str, version: str) -> Identity:
+    """From the answers to ``QName`` and ``QVer``. The board has no serial number."""
+    return Identity(model=f"shvps {name}".rstrip(), firmware=version)
+
+
 class Codec:
     """Bytes to lines of printable ASCII. ``counters``: ``bad_grammar``, ``too_long``."""
 
@@ -274,11 +285,10 @@ class Shvps:
         )
 
     def _set_up(self) -> Script[str, str]:
-        version = _VERSION.fullmatch((yield Ask("QVer")).message)
-        assert version is not None
-        if version[1] != "slave":
+        kind, version = version_of((yield Ask("QVer")).message)
+        if kind != "slave":
             raise DeviceRefused(
-                self._label, f"it is a {version[1]}, not a single-channel supply", "Connect the supply itself."
+                self._label, f"it is a {kind}, not a single-channel supply", "Connect the supply itself."
             )
         name = (yield from self._ask("QName")).message
         max_volts = yield from self._number("QVmax")
@@ -289,13 +299,13 @@ class Shvps:
         if not 0 < max_volts <= 20_000:
             raise DeviceRefused(self._label, f"it states a maximum of {max_volts} V", "Check its configuration.")
         self._jack_missing = bool(needs_jack) and not jack
-        self.identity = Identity(model=f"shvps {name}", firmware=version[2])
+        self.identity = identity(name, version)
         self._max_volts = float(max_volts)
         self._setpoint = self._target = setpoint
         self._on = mode != OFF
         self.settings |= {
             "name": name,
-            "firmware": version[2],
+            "firmware": version,
             "maximum_V": str(max_volts),
             "setpoint_at_setup_V": str(setpoint),
             "output_at_setup": "off" if mode == OFF else f"mode {mode}",

@@ -292,23 +292,22 @@ def _benchmark(run: Callable[..., Any], render: Callable[..., Any], name: str, f
 
 
 @main.command()
-@click.option("--port", "ports", multiple=True, help="Ask on this serial port; default: all that the system lists.")
-@click.option("--bus", "buses", multiple=True, metavar="INTERFACE:CHANNEL", help="Ask on this CAN bus too.")
+@click.option("--port", "ports", multiple=True, help="Ask on this serial port only.")
+@click.option("--bus", "buses", multiple=True, metavar="INTERFACE:CHANNEL[@BITRATE]", help="Ask on this CAN bus only.")
 def devices(ports: tuple[str, ...], buses: tuple[str, ...]) -> None:
     """List who answers on which port and bus, and propose the lines for a scene. Sends only questions."""
     from drivers.discovery import Bus, discover
     from rig.clock import RealClock
     from rig.tables import devices_table, show
 
-    asked = []
-    for text in buses:
-        interface, colon, channel = text.partition(":")
-        if not (interface and colon and channel):
-            raise click.BadParameter(f"{text!r} is not INTERFACE:CHANNEL, e.g. slcan:/dev/ttyACM0", param_hint="--bus")
-        asked.append(Bus(interface, channel))
-    found = discover(RealClock(), list(ports) or None, asked)
+    try:
+        named = [Bus.parse(text) for text in buses]
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.", param_hint="--bus") from None
+    everywhere = not (ports or buses)
+    found = discover(RealClock(), None if everywhere else ports, None if everywhere else named)
     show(*devices_table(found))
-    if (ports or buses) and not all(one.role for one in found):
+    if not everywhere and not all(one.role for one in found):
         click.get_current_context().exit(1)
 
 

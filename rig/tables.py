@@ -146,7 +146,7 @@ def truth_table(found: Found) -> RenderableType:
 def devices_table(found: Sequence[FoundDevice]) -> list[RenderableType]:
     """Who answers where, and below it the lines that name them in a scene."""
     if not found:
-        return ["No serial port was found, and no CAN bus was asked. Name one with --port or --bus."]
+        return ["The system names no serial port and no CAN channel. Name one with --port or --bus."]
     table = Table(title="Ports and buses")
     for heading in ("where", "role", "driver", "model", "serial number", "firmware", "remark"):
         table.add_column(heading, overflow="fold")

@@ -55,7 +55,7 @@ def ready(*changes: tuple[str, str], scene: str = "cone-4mm") -> Iterator[tuple[
         assert old in text
         text = text.replace(old, new)
     with closing(Bench(parse_table(text, Scene, "scene", "test"))) as bench:
-        bench.attach(lambda role, way, data: None)
+        bench.attach(lambda *told: None)
         samples: dict[str, list[Sample]] = {role: [] for role in bench.devices}
         while bench.clock.now() < 2.0:
             for role, device in bench.devices.items():
