@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from inspect import signature
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from drivers.link import ByteLink, CanFrame, FrameLink
@@ -26,7 +27,9 @@ from rig.scene import (
 )
 
 if TYPE_CHECKING:
+    from rig.replay.bench import ReplayBench
     from rig.sim.bench import SimulatedBench
+    from rig.sim.wire import ByteWire, FrameWire
 
 
 class Tap(Protocol):
@@ -83,6 +86,20 @@ class TappedFrameLink:
         self._link.close()
 
 
+class Wired(Protocol):
+    """A bench in memory, simulated or replayed, as seen from the host's ends of its wires."""
+
+    def prepare(self) -> None:
+        """Do now what takes long."""
+        ...
+
+    def wire(self, role: str) -> ByteWire | FrameWire: ...
+
+    def advance(self, t: float) -> None:
+        """Let everything up to time ``t`` happen."""
+        ...
+
+
 class Bench:
     """The instruments of one scene behind one clock.
 
@@ -95,6 +112,12 @@ class Bench:
         Virtual when the simulated bench is in memory, real otherwise.
     simulated : SimulatedBench or None
         The bench in memory, with its hidden truth, for tests and for the demonstration's comparison.
+
+    Parameters
+    ----------
+    scene : Scene
+    wired : Wired, optional
+        A bench in memory, in place of what the scene names.
     """
 
     stage: Stage
@@ -102,7 +125,7 @@ class Bench:
     displacement: DisplacementSensor | None
     hv: HVSupply | None
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, wired: Wired | None = None) -> None:
         self.scene = scene
         self.simulated: SimulatedBench | None = None
         self.clock: Clock
@@ -111,10 +134,10 @@ class Bench:
         self.devices: dict[str, Device] = {}
         self._polled_at: float | None = None
         try:
-            if scene.on_real_ports:
+            if wired is None and scene.on_real_ports:
                 self._open_ports()
             else:
-                self._open_memory()
+                self._open_memory(wired if wired is not None else wired_bench(scene))
         except BaseException:
             self.close()
             raise
@@ -133,20 +156,20 @@ class Bench:
                 assert table.port is not None
                 self._byte_links[role] = SerialLink(role, table.port, table.baud)
 
-    def _open_memory(self) -> None:
+    def _open_memory(self, wired: Wired) -> None:
         from rig.memory_link import MemoryByteLink, MemoryFrameLink
+        from rig.sim.bench import SimulatedBench
         from rig.sim.wire import FrameWire
 
-        simulated = simulated_bench(self.scene)
-        simulated.prepare()
-        clock = VirtualClock(simulated.advance)
+        wired.prepare()
+        clock = VirtualClock(wired.advance)
         for role in self.scene.instruments:
-            wire = simulated.wire(role)
+            wire = wired.wire(role)
             if isinstance(wire, FrameWire):
                 self._frame_links[role] = MemoryFrameLink(role, wire, clock)
             else:
                 self._byte_links[role] = MemoryByteLink(role, wire, clock)
-        self.simulated = simulated
+        self.simulated = wired if isinstance(wired, SimulatedBench) else None
         self.clock = clock
 
     def attach(self, tap: Tap) -> None:
@@ -226,6 +249,33 @@ class Bench:
 def arguments(table: Instrument, driver: type[Device]) -> dict[str, Any]:
     """What a scene says to a driver: the keys that are named like its arguments."""
     return table.model_dump(include=set(signature(driver).parameters))
+
+
+def wired_bench(scene: Scene, *, whole: bool = True) -> SimulatedBench | ReplayBench:
+    """The bench in memory that a scene names: a log that answers in its place, or the simulated one.
+
+    ``whole`` is for the log: whether each write of the host is one whole request.
+
+    Raises
+    ------
+    ConfigError
+        When the log's instruments are not those of the scene.
+    LogError
+        When the log cannot be read.
+    """
+    if scene.bench is None:
+        return simulated_bench(scene)
+    from rig.errors import ConfigError
+    from rig.replay.bench import ReplayBench
+    from rig.replay.recording import load_recording
+
+    recording = load_recording(Path(scene.bench.log))
+    then = recording.experiment.scene.instruments
+    now = {role: table.driver for role, table in scene.instruments.items()}
+    if now != {role: table.driver for role, table in then.items()}:
+        listed = ", ".join(f"{role} {table.driver}" for role, table in then.items())
+        raise ConfigError(f"{scene.bench.log} was recorded with other instruments than the scene names: {listed}.")
+    return ReplayBench(recording, whole=whole)
 
 
 def simulated_bench(scene: Scene) -> SimulatedBench:

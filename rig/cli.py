@@ -140,8 +140,8 @@ def continue_(log: Path | None) -> None:
 @main.command()
 @click.argument("scene", type=FILE)
 def sim(scene: Path) -> None:
-    """Serve the simulated bench of SCENE on pseudo-terminals until stopped; prints the ports as JSON."""
-    from rig.bench import simulated_bench
+    """Serve the simulated bench of SCENE, or the log in its place, on pseudo-terminals; prints the ports as JSON."""
+    from rig.bench import wired_bench
     from rig.clock import RealClock
     from rig.errors import ConfigError
     from rig.scene import load_scene
@@ -152,7 +152,7 @@ def sim(scene: Path) -> None:
     from rig.sim.server import Server
 
     loaded, _ = load_scene(scene)
-    server = Server(simulated_bench(loaded), RealClock())
+    server = Server(wired_bench(loaded, whole=False), RealClock())
     with stop_on_signals() as stop:
         try:
             click.echo(json.dumps(server.ports))
@@ -330,6 +330,32 @@ def recover(log: Path, out: Path) -> None:
     recovery = rescue(log, out)
     click.echo(recovery.report)
     click.get_current_context().exit(recovery.exit_code)
+
+
+@main.command()
+@click.argument("log", type=FILE)
+@click.option("--verify", is_flag=True, help="Recorded bytes through today's drivers: the same samples?")
+@click.option("--rerun", is_flag=True, help="Today's engine and drivers, answered by LOG: the same requests?")
+def replay(log: Path, verify: bool, rerun: bool) -> None:
+    """Hold today's software against LOG; without an option, in both ways.
+
+    The first difference is reported: for --verify with the byte offset in what the instrument sent, its bytes, what was
+    recorded and what is decoded today; for --rerun with both requests in hex and the step of the protocol.
+
+    Exit code 0: all is as recorded; 3: all is, as far as the log is whole (it says how far); 1: something differs, or
+    the log cannot be used.
+    """
+    from rig.replay.recording import load_recording
+    from rig.replay.rerun import rerun as run_again
+    from rig.replay.verify import verify as verify_samples
+
+    recording = load_recording(log)
+    both = not (verify or rerun)
+    found = [do(recording) for do, asked in ((verify_samples, verify), (run_again, rerun)) if asked or both]
+    for result in found:
+        click.echo(result.report)
+    codes = {result.exit_code for result in found}
+    click.get_current_context().exit(1 if 1 in codes else max(codes))
 
 
 @main.command()

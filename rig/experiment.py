@@ -25,7 +25,8 @@ from rig.scene import Scene, load_scene
 from rig.signals import stop_on_signals
 from rig.teardown import ADVICE
 
-IN_MEMORY = "simulated in memory"  # in a log's metadata: its truth is that of its own scene
+# In a log's metadata: on what bench it was. In memory its truth is that of its own scene.
+IN_MEMORY, ON_PORTS = "simulated in memory", "real ports"
 RECORDED_PACKAGES = ("dea-rig", "numpy", "scipy", "mcap", "protobuf", "pydantic", "pyserial", "python-can")
 
 
@@ -121,7 +122,7 @@ def run(
                 bench,
                 experiment.actions,
                 log,
-                _gains(certificates),
+                gains_of(certificates),
                 control,
                 progress,
                 certificates,
@@ -176,7 +177,8 @@ def _check_dates(certificates: dict[str, Certificate], clock: Clock) -> list[str
     return [problem for certificate in certificates.values() for problem in certificate.check("", today)]
 
 
-def _gains(certificates: dict[str, Certificate]) -> Gains:
+def gains_of(certificates: dict[str, Certificate]) -> Gains:
+    """Quantity per reading of each sensor, by the certificates."""
     gain = {role: certificate.gain for role, certificate in certificates.items()}
     force = certificates["force"]  # every scene names it
     return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit)
@@ -195,7 +197,7 @@ def _attach(log: LogWriter, experiment: Experiment, problems: list[str]) -> None
             "scene": experiment.scene.title,
             "protocol": experiment.protocol.title,
             "specimen": experiment.scene.specimen.name,
-            "bench": "real ports" if experiment.scene.on_real_ports else IN_MEMORY,
+            "bench": ON_PORTS if experiment.scene.on_real_ports else IN_MEMORY,
             "without_certificate": " ".join(role for role in uncalibrated if role != "stage"),
             "certificate_problems": "; ".join(problems),
         },

@@ -218,6 +218,13 @@ class IsegTable(CanTable):
 Instrument = ZaberTable | GSV8Table | CiA404Table | KeyenceTable | IsegTable | ShvpsTable
 
 
+class BenchTable(Table):
+    """A log in place of the instruments: it answers what it was asked when it was recorded, and nothing else."""
+
+    backend: Literal["replay"]
+    log: str = Field(min_length=1)
+
+
 class Scene(Table):
     """Everything about the bench for one specimen. See the module's docstring."""
 
@@ -229,6 +236,7 @@ class Scene(Table):
     displacement: KeyenceTable | None = None
     hv: Annotated[IsegTable | ShvpsTable, Field(discriminator="driver")] | None = None
     simulation: SimulationSettings | None = None
+    bench: BenchTable | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -249,7 +257,9 @@ class Scene(Table):
         if named and len(named) < len(self.instruments):
             missing = [role for role in self.instruments if role not in named]
             raise ValueError(f"{', '.join(named)} has a port but {', '.join(missing)} has none; name all or none")
-        if not named and self.simulation is None:
+        if named and self.bench is not None:
+            raise ValueError(f"{', '.join(named)} has a port, but [bench] names a log in their place: leave one out")
+        if not named and self.simulation is None and self.bench is None:
             raise ValueError("no instrument has a port and there is no [simulation] table: nothing to run on")
         for role in TWINS:
             table = self.instruments.get(role)
@@ -314,7 +324,7 @@ class Scene(Table):
         ConfigError
             When a role is missing from ``ports`` or a port's keys are not those of the instrument.
         """
-        raw = self.model_dump(exclude_none=True)
+        raw = self.model_dump(exclude_none=True, exclude={"bench"})
         for role in self.instruments:
             if role not in ports:
                 raise ConfigError(f"The ports name no {role!r}; they name {', '.join(sorted(ports)) or 'nothing'}.")
@@ -335,4 +345,8 @@ def load_scene(path: Path) -> tuple[Scene, str]:
     ConfigError
         Naming file, key, value and what is allowed.
     """
-    return load_table(path, Scene, "scene")
+    scene, text = load_table(path, Scene, "scene")
+    if scene.bench is not None:  # a log is named as seen from the scene, like certificates
+        log = scene.bench.model_copy(update={"log": str(path.parent / scene.bench.log)})
+        scene = scene.model_copy(update={"bench": log})
+    return scene, text

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from rig.clock import Clock
-from rig.sim.bench import SimulatedBench
 from rig.sim.slcan import SlcanAdapter
 from rig.sim.wire import ByteWire, FrameWire, WireGone
 
@@ -87,18 +86,35 @@ class _Port:
         self.master = self._slave = -1
 
 
+class Served(Protocol):
+    """A bench in memory, simulated or replayed: instruments by role, their wires, and time."""
+
+    now: float
+
+    @property
+    def instruments(self) -> Mapping[str, object]: ...
+
+    def prepare(self) -> None: ...
+
+    def wire(self, role: str) -> ByteWire | FrameWire: ...
+
+    def advance(self, t: float) -> None: ...
+
+    def next_time(self) -> float: ...
+
+
 class Server:
     """Serve ``bench`` on pseudo-terminals from now on.
 
     Parameters
     ----------
-    bench : SimulatedBench
+    bench : Served
         Its time starts with the clock's time at the call of `run`.
     clock : Clock
         Real time.
     """
 
-    def __init__(self, bench: SimulatedBench, clock: Clock) -> None:
+    def __init__(self, bench: Served, clock: Clock) -> None:
         self._bench = bench
         self._clock = clock
         self._ports: dict[str, _Port] = {}

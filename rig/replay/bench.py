@@ -1,0 +1,223 @@
+"""A bench that answers from a log: what an instrument once said to a request, it says to the same request again.
+
+Each instrument's answers come as long after its request as they did then. What it sent by itself comes as long after
+the request before it. Requests must come in the order of the log; any other is a `ReplayError`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import NamedTuple, NoReturn
+
+from drivers.link import DeviceError
+from rig.replay.recording import Recording
+from rig.scene import CanTable
+from rig.sim.wire import ByteWire, Frame, FrameWire
+
+
+class ReplayError(DeviceError):
+    """A request that the log has no answer to, because it is not the one that was made then."""
+
+
+class Passed(NamedTuple):
+    """What passed on a wire at ``t``: sent by the host, or read by it."""
+
+    t: float
+    sent: bool
+    data: bytes
+
+
+class Departure(NamedTuple):
+    """Where the requests to an instrument depart from the log.
+
+    Attributes
+    ----------
+    role, number : str, int
+        The instrument, and which of its requests, counted from 1.
+    t : float
+        When the request was made, or was to be made (s).
+    step : str
+        What the protocol was doing then.
+    recorded, made : bytes or None
+        Both requests; None where the log has no further one, or none was made.
+    """
+
+    role: str
+    number: int
+    t: float
+    step: str
+    recorded: bytes | None
+    made: bytes | None
+
+    def __str__(self) -> str:
+        recorded = "none, the log ends before" if self.recorded is None else self.recorded.hex(" ")
+        made = "none" if self.made is None else self.made.hex(" ")
+        return (
+            f"request {self.number} to the {self.role} is not the recorded one, at {self.t:.3f} s in {self.step}: "
+            f"recorded {recorded}; made {made}"
+        )
+
+
+class _Script:
+    """What passed on one wire, gone through request by request."""
+
+    def __init__(self, rows: list[Passed], depart: Callable[[float, bytes], NoReturn]) -> None:
+        self.requests = 0
+        self._tell = depart
+        self._rest = deque(rows)
+        self._coming: deque[tuple[float, bytes]] = deque()
+        self._partial = b""
+        self._release(0.0)
+
+    @property
+    def due(self) -> Passed | None:
+        """The recorded request that comes next; None at the end of the log."""
+        return self._rest[0] if self._rest else None
+
+    def write(self, data: bytes, t: float) -> None:
+        """Take what the host sends, in pieces of any size; raises `ReplayError` where it is not what was sent then."""
+        self._partial += data
+        while self._partial:
+            due = self.due
+            if due is None or not (self._partial.startswith(due.data) or due.data.startswith(self._partial)):
+                self._depart(t)
+            elif len(self._partial) < len(due.data):
+                return
+            else:
+                self._partial = self._partial[len(due.data) :]
+                self._rest.popleft()
+                self.requests += 1
+                self._release(t - due.t)
+
+    def write_whole(self, data: bytes, t: float) -> None:
+        """The same of one whole request."""
+        self.write(data, t)
+        if self._partial:
+            self._depart(t)
+
+    def read(self, t: float) -> list[bytes]:
+        """What has arrived at the host by ``t``, in the pieces in which it was read then."""
+        arrived = []
+        while self._coming and self._coming[0][0] <= t:
+            arrived.append(self._coming.popleft()[1])
+        return arrived
+
+    @property
+    def next_arrival(self) -> float:
+        return self._coming[0][0] if self._coming else math.inf
+
+    def _release(self, later: float) -> None:
+        """What came before the next request is on its way, so much later than then."""
+        while self._rest and not self._rest[0].sent:
+            t, _, data = self._rest.popleft()
+            self._coming.append((t + later, data))
+
+    def _depart(self, t: float) -> NoReturn:
+        made, self._partial = self._partial, b""
+        self._tell(t, made)
+
+
+class _ReplayByteWire(ByteWire):
+    """A serial line with a log at its far end."""
+
+    def __init__(self, script: _Script, *, whole: bool) -> None:
+        super().__init__()
+        self._script = script
+        self._write = script.write_whole if whole else script.write
+
+    def host_write(self, data: bytes, t: float) -> None:
+        self._write(data, t)
+
+    def host_read(self, t: float) -> bytes:
+        return b"".join(self._script.read(t))
+
+    @property
+    def next_arrival(self) -> float:
+        return self._script.next_arrival
+
+
+class _ReplayFrameWire(FrameWire):
+    """A CAN bus with a log at its far end."""
+
+    def __init__(self, script: _Script, bitrate: int) -> None:
+        super().__init__(bitrate=bitrate)
+        self._script = script
+
+    def host_write(self, frame: Frame, t: float) -> None:
+        self._script.write_whole(frame[0].to_bytes(2, "big") + bytes(frame[1]), t)
+
+    def host_read(self, t: float) -> list[Frame]:
+        return [(int.from_bytes(row[:2], "big"), row[2:]) for row in self._script.read(t)]
+
+    @property
+    def next_arrival(self) -> float:
+        return self._script.next_arrival
+
+
+class ReplayBench:
+    """The instruments of a recording, in the place of a `rig.sim.bench.SimulatedBench`.
+
+    Parameters
+    ----------
+    recording : Recording
+    whole : bool
+        Whether every write of the host is one whole request, as in memory; over a port it may come in any pieces.
+
+    Attributes
+    ----------
+    departures : list of Departure
+        In the order in which they happened.
+    """
+
+    def __init__(self, recording: Recording, *, whole: bool = True) -> None:
+        self.recording = recording
+        self.now = 0.0
+        self.departures: list[Departure] = []
+        self.scripts: dict[str, _Script] = {}
+        self._wires: dict[str, ByteWire | FrameWire] = {}
+        passed: dict[str, list[Passed]] = {}
+        for row in recording.rows:
+            if row.topic.startswith("/raw/"):
+                _, _, role, way = row.topic.split("/")
+                passed.setdefault(role, []).append(Passed(row.t, way == "tx", row.fields["data"]))
+        for role, table in recording.experiment.scene.instruments.items():
+            script = self.scripts[role] = _Script(passed.get(role, []), partial(self._depart, role))
+            if isinstance(table, CanTable):
+                self._wires[role] = _ReplayFrameWire(script, table.bitrate)
+            else:
+                self._wires[role] = _ReplayByteWire(script, whole=whole)
+
+    def departure(self, role: str, t: float, made: bytes | None) -> Departure:
+        """That ``made`` was sent at ``t`` where the log has something else."""
+        script = self.scripts[role]
+        due = script.due
+        step = self.recording.step_at(t if due is None else due.t)
+        return Departure(role, script.requests + 1, t, step, None if due is None else due.data, made)
+
+    def _depart(self, role: str, t: float, made: bytes) -> NoReturn:
+        self.departures.append(self.departure(role, t, made))
+        advice = "The bench is a log, and can only answer what was asked then."
+        raise ReplayError(role, str(self.departures[-1]), advice)
+
+    @property
+    def instruments(self) -> Mapping[str, object]:
+        """By role, what stands for the instrument."""
+        return self.scripts
+
+    def prepare(self) -> None:
+        """Nothing takes long."""
+
+    def wire(self, role: str) -> ByteWire | FrameWire:
+        """The wire to the instrument of ``role``; the host uses its ``host_write`` and ``host_read``."""
+        return self._wires[role]
+
+    def advance(self, t: float) -> None:
+        """Nothing happens by itself but what is on its way already."""
+        self.now = t
+
+    def next_time(self) -> float:
+        """When something arrives at the host next; inf if nothing will until it asks."""
+        return min(script.next_arrival for script in self.scripts.values())

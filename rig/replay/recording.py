@@ -1,0 +1,161 @@
+"""A log as what it was: an experiment, and everything that passed on its wires, in the order of the file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from calibration.certificate import Certificate, CertificateError, parse_certificate
+from rig.errors import LimitError
+from rig.experiment import ON_PORTS, Experiment
+from rig.log import schema
+from rig.log.errors import LogError
+from rig.log.reader import Log, read_log
+from rig.plan import plan
+from rig.protocol import Protocol
+from rig.scene import Scene
+from rig.toml_file import parse_table
+
+_NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+
+
+class Row(NamedTuple):
+    """One message: its topic, its payload as it lies in the log, its fields."""
+
+    topic: str
+    payload: bytes
+    fields: dict[str, Any]
+
+    @property
+    def t(self) -> float:
+        """The row's own time, in seconds since the start of the run."""
+        return float(self.fields["t_s"])
+
+
+class Step(NamedTuple):
+    """What the protocol was doing from ``t`` on."""
+
+    t: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One log, ready to be replayed.
+
+    Attributes
+    ----------
+    log : Log
+    rows : list of Row
+        In the order of the file, which is the order in which things happened, up to the first gap.
+    problem : str
+        What of the log cannot be replayed and why; empty when it is whole.
+    """
+
+    log: Log
+    rows: list[Row]
+    problem: str
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """Scene, protocol and certificates from inside the log, planned anew."""
+        where = f"{self.log.path} ({{}} inside)"
+        scene_text, protocol_text = self.text("scene.toml"), self.text("protocol.toml")
+        scene = parse_table(scene_text, Scene, "scene", where.format("scene.toml"))
+        protocol = parse_table(protocol_text, Protocol, "protocol", where.format("protocol.toml"))
+        try:
+            actions = plan(protocol, scene)
+        except LimitError as error:
+            raise LogError(self.log.path, f"its protocol cannot be planned today ({error})") from None
+        return Experiment(scene, scene_text, protocol, protocol_text, self.certificates, actions, [])
+
+    @cached_property
+    def certificates(self) -> dict[str, Certificate]:
+        """By role, those that the log holds."""
+        found: dict[str, Certificate] = {}
+        for name, attachment in self.log.attachments.items():
+            if name.startswith("certificate."):
+                try:
+                    certificate = parse_certificate(attachment.data, f"{self.log.path} ({name} inside)")
+                except CertificateError as error:
+                    raise LogError(self.log.path, str(error)) from None
+                found[certificate.role] = certificate
+        return found
+
+    @cached_property
+    def steps(self) -> list[Step]:
+        """The protocol's steps, in the order of time."""
+        phases = [row.fields for row in self.rows if row.topic == "/phase"]
+        return [Step(f["t_s"], f"step {f['step']} ({f['kind']}: {f['label']})") for f in phases]
+
+    def step_at(self, t: float) -> str:
+        """What the protocol was doing at time ``t``."""
+        return next((step.text for step in reversed(self.steps) if step.t <= t), "the set-up, before the first step")
+
+    def text(self, name: str) -> str:
+        """A text file from inside the log."""
+        attachment = self.log.attachments.get(name)
+        if attachment is None:
+            raise LogError(self.log.path, f"has no {name} inside that can be read", "It cannot be replayed.")
+        return attachment.data.decode(errors="replace")
+
+    @property
+    def in_virtual_time(self) -> bool:
+        """Whether the run's clock was a virtual one, so that its times come out the same again."""
+        return self.log.metadata.get("run", {}).get("bench") != ON_PORTS
+
+
+def numbers(argument: str) -> list[float]:
+    """The numbers in the argument of a command, as they were given."""
+    return [float(number) for number in _NUMBER.findall(argument)]
+
+
+def load_recording(path: Path) -> Recording:
+    """The log at ``path``, finished, cut short or damaged.
+
+    Raises
+    ------
+    LogError
+        The file cannot be read, is not a log of this schema version, or holds nothing that passed on a wire.
+    """
+    log = read_log(path)
+    if not any(topic.startswith("/raw/") for topic in log.topics):
+        raise LogError(path, "holds no bytes of any wire", "There is nothing to replay.")
+    rows: list[Row] = []
+    problem = "" if log.ended else "it was cut short"
+    for chunk in _chunks(log):
+        if chunk is None:
+            problem = "something is missing after that"
+            break
+        rows += chunk
+    if log.gaps:
+        gap = log.gaps[0]
+        problem = f"{problem or 'damaged'}; bytes {gap.start} to {gap.end} of the file: {gap.reason}"
+    return Recording(log, rows, problem)
+
+
+def _chunks(log: Log) -> Iterator[list[Row] | None]:
+    """The rows of each chunk; None, and then nothing more, where messages are missing."""
+    expected: dict[str, int] = {}
+    rows: list[Row] = []
+    for message in log.raw_messages():
+        if message is None:
+            yield rows
+            rows = []
+            continue
+        channel, sequence, _, _, payload = message
+        topic = channel.topic
+        if topic not in schema.CHANNELS:
+            continue
+        if sequence != expected.get(topic, 1):
+            yield None
+            return
+        expected[topic] = sequence + 1
+        try:
+            rows.append(Row(topic, payload, schema.decode(topic, payload)))
+        except ValueError as error:
+            raise LogError(log.path, str(error), "Another program wrote it, or wrote into it.") from error

@@ -1,0 +1,371 @@
+"""The recorded bytes through today's drivers: every sample that comes out must be the recorded one, bit for bit.
+
+A driver knows the world by the bytes that it reads, the time of each poll, and the commands that it is given. All
+three are in the log, in the order in which they happened, so that a driver fed with them gives the same samples again.
+Its requests must be the recorded ones too: an answer means nothing without its question.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, cast
+
+from drivers.link import DeviceError
+from drivers.roles import HVSupply, Stage
+from rig.bench import Bench
+from rig.experiment import gains_of
+from rig.log import schema
+from rig.recorder import Recorder
+from rig.replay.recording import Recording, Row, numbers
+from rig.scene import CanTable, Scene
+from rig.sim.wire import ByteWire, Frame, FrameWire
+
+if TYPE_CHECKING:
+    from rig.log.writer import LogWriter
+
+SAMPLES = {f"/{role}/sample": role for role in schema.ROLES}
+MOST_BYTES = 64  # of a stream, in a report
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Where today's drivers first depart from the log.
+
+    Attributes
+    ----------
+    role, kind : str
+        Whose; "sample" or "request".
+    t : float
+        Time of the poll (s).
+    step : str
+        What the protocol was doing.
+    offset : int
+        Where in all that the instrument sent the bytes begin that came since its last sample.
+    data : bytes
+        Those bytes.
+    recorded, decoded : str
+        What the log has, and what comes out today.
+    """
+
+    role: str
+    kind: str
+    t: float
+    step: str
+    offset: int
+    data: bytes
+    recorded: str
+    decoded: str
+
+    def __str__(self) -> str:
+        end = self.offset + len(self.data)
+        more = " ..." if len(self.data) > MOST_BYTES else ""
+        return (
+            f"{self.role}: the first {self.kind} that differs is at {self.t:.6f} s, in {self.step}, "
+            f"from bytes {self.offset} to {end} of what the instrument sent\n"
+            f"  bytes     {self.data[:MOST_BYTES].hex(' ') or '(none)'}{more}\n"
+            f"  recorded  {self.recorded}\n"
+            f"  today     {self.decoded}"
+        )
+
+
+@dataclass(frozen=True)
+class Verification:
+    """``samples`` and ``requests`` were equal, by role; ``difference`` is None when all of them were."""
+
+    recording: Recording
+    samples: dict[str, int]
+    requests: dict[str, int]
+    until: float
+    difference: Difference | None
+
+    @property
+    def exit_code(self) -> int:
+        """0 all equal; 3 equal as far as the log is whole; 1 different."""
+        return 1 if self.difference is not None else 3 if self.recording.problem else 0
+
+    @property
+    def report(self) -> str:
+        counts = ", ".join(f"{role} {n}" for role, n in self.samples.items())
+        path = self.recording.log.path
+        if self.difference is not None:
+            return f"{path}: DIFFERENT. {self.difference}\nEqual before that: samples of {counts}."
+        requests = sum(self.requests.values())
+        text = f"{path}: every sample comes out as recorded, bit for bit: {counts}; so do {requests} requests."
+        if self.recording.problem:
+            text += f"\nVerified up to {self.until:.3f} s, no further: {self.recording.problem}."
+        return text
+
+
+def verify(recording: Recording) -> Verification:
+    """Feed what was recorded to today's drivers and compare."""
+    return _Verifier(recording).run()
+
+
+class _FedByteWire(ByteWire):
+    """Gives what it is fed and keeps what is sent."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.arrived: list[bytes] = []
+        self.sent: list[bytes] = []
+
+    def host_read(self, t: float) -> bytes:
+        data, self.arrived = b"".join(self.arrived), []
+        return data
+
+    def host_write(self, data: bytes, t: float) -> None:
+        self.sent.append(data)
+
+
+class _FedFrameWire(FrameWire):
+    """The same for frames, each as the log has it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.arrived: list[bytes] = []
+        self.sent: list[bytes] = []
+
+    def host_read(self, t: float) -> list[Frame]:
+        rows, self.arrived = self.arrived, []
+        return [(int.from_bytes(row[:2], "big"), row[2:]) for row in rows]
+
+    def host_write(self, frame: Frame, t: float) -> None:
+        self.sent.append(frame[0].to_bytes(2, "big") + frame[1])
+
+
+class _Desk:
+    """A bench with nothing on its wires but what is fed."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.wires = {
+            role: _FedFrameWire() if isinstance(table, CanTable) else _FedByteWire()
+            for role, table in scene.instruments.items()
+        }
+
+    def prepare(self) -> None:
+        """Nothing takes long."""
+
+    def wire(self, role: str) -> ByteWire | FrameWire:
+        return self.wires[role]
+
+    def advance(self, t: float) -> None:
+        """Nothing happens by itself."""
+
+
+class _Rows:
+    """Takes the place of a log: the newest row that a recorder wrote."""
+
+    def __init__(self) -> None:
+        self.newest: tuple[str, bytes] = ("", b"")
+
+    def write(self, topic: str, fields: dict[str, Any], log_ns: int, publish_ns: int) -> None:
+        self.newest = topic, schema.encode(topic, fields)
+
+
+@dataclass
+class _Stream:
+    """What is known of one instrument while the log is gone through.
+
+    ``arrived`` and ``sent`` belong to the poll in the making, which was at ``t``; ``mark`` is where its stream stood
+    at its last sample but one, for the report.
+    """
+
+    t: float = math.nan
+    arrived: list[bytes] = field(default_factory=list)
+    sent: list[bytes] = field(default_factory=list)
+    decoded: deque[bytes] = field(default_factory=deque)
+    since: bytearray = field(default_factory=bytearray)
+    offset: int = 0
+    fresh: bool = True
+    error: str = ""
+    samples: int = 0
+    requests: int = 0
+
+
+class _Different(Exception):
+    def __init__(self, difference: Difference) -> None:
+        self.difference = difference
+
+
+class _Verifier:
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        scene = recording.experiment.scene
+        self._desk = _Desk(scene)
+        self._bench = Bench(scene, self._desk)
+        self._rows = _Rows()
+        self._recorder = Recorder(
+            cast("LogWriter", self._rows),
+            self._bench.clock,
+            gains_of(recording.experiment.certificates),
+            has_laser=scene.displacement is not None,
+        )
+        self._streams = {role: _Stream() for role in scene.instruments}
+        self._commands = _commands(self._bench)
+        self._until = 0.0
+
+    def run(self) -> Verification:
+        self._bench.attach(lambda role, way, data, t: None)
+        difference = None
+        try:
+            for row in self._recording.rows:
+                self._take(row)
+            for role in self._streams:
+                self._end(role)
+        except _Different as found:
+            difference = found.difference
+        return Verification(
+            self._recording,
+            {role: stream.samples for role, stream in self._streams.items()},
+            {role: stream.requests for role, stream in self._streams.items()},
+            self._until,
+            difference,
+        )
+
+    def _take(self, row: Row) -> None:
+        self._until = max(self._until, row.t)
+        match row.topic.split("/")[1:]:
+            case ["raw", role, way] if role in self._streams:
+                self._on_wire(role, way, row.t, row.fields["data"])
+            case [role, "sample"] if role in self._streams:
+                self._poll(role)
+                self._compare(role, row)
+            case ["command"] if row.fields["device"] in self._streams:
+                self._poll(row.fields["device"])
+                self._command(row.fields)
+            case ["event"] if row.fields["source"] in self._streams:
+                self._poll(row.fields["source"])  # what comes after that is another poll, or the end
+            case ["reference"]:
+                self._reference(row.fields["name"], row.fields["value"])
+
+    def _on_wire(self, role: str, way: str, t: float, data: bytes) -> None:
+        """Everything read in a poll was read before anything was sent in it."""
+        stream = self._streams[role]
+        if t != stream.t or (way == "rx" and stream.sent):
+            self._poll(role)
+        stream.t = t
+        (stream.arrived if way == "rx" else stream.sent).append(data)
+
+    def _poll(self, role: str) -> None:
+        """Let today's driver do what was done in the poll that has been gathered."""
+        stream = self._streams[role]
+        if not (stream.arrived or stream.sent):
+            return
+        wire = self._desk.wires[role]
+        self._arrive(stream)
+        wire.arrived, stream.arrived = stream.arrived, []
+        while True:
+            try:
+                samples = self._bench.devices[role].poll(stream.t)
+                break
+            except DeviceError as error:
+                # In the run it was raised by a poll that left no trace in the log, and then it was polled on.
+                if str(error) == stream.error:
+                    samples = []
+                    break
+                stream.error = str(error)
+        for sample in samples:
+            self._recorder.add(sample)
+            stream.decoded.append(self._rows.newest[1])
+        self._compare_requests(role)
+
+    def _arrive(self, stream: _Stream) -> None:
+        if stream.fresh:
+            stream.offset += len(stream.since)
+            stream.since.clear()
+            stream.fresh = False
+        for data in stream.arrived:
+            stream.since += data
+
+    def _compare_requests(self, role: str) -> None:
+        stream, wire = self._streams[role], self._desk.wires[role]
+        recorded, stream.sent = stream.sent, []
+        sent, wire.sent = wire.sent, []
+        if sent != recorded:
+            first = next(n for n in range(len(sent) + 1) if sent[n : n + 1] != recorded[n : n + 1])
+            why = f" (the driver says: {stream.error})" if stream.error else ""
+            raise self._different(role, "request", _hex(recorded[first:]), _hex(sent[first:]) + why)
+        stream.requests += len(sent)
+
+    def _compare(self, role: str, row: Row) -> None:
+        stream = self._streams[role]
+        recorded = _in_words(row.topic, row.payload)
+        if not stream.decoded:
+            why = f": the driver says: {stream.error}" if stream.error else ""
+            raise self._different(role, "sample", recorded, f"no sample{why}")
+        decoded = stream.decoded.popleft()
+        if decoded != row.payload:
+            raise self._different(role, "sample", recorded, _in_words(row.topic, decoded))
+        stream.samples += 1
+        stream.fresh = True
+
+    def _command(self, fields: dict[str, Any]) -> None:
+        command = self._commands.get((fields["device"], fields["command"]))
+        if command is None:
+            return
+        try:
+            command(numbers(fields["argument"]))
+        except DeviceError as error:
+            self._streams[fields["device"]].error = str(error)
+
+    def _reference(self, name: str, value: float) -> None:
+        match name:
+            case "force_zero":
+                self._recorder.force_zero = value
+            case "displacement_zero":
+                self._recorder.displacement_zero = value
+
+    def _end(self, role: str) -> None:
+        """What was sent last in a run that was ended properly is what closing the device says."""
+        stream = self._streams[role]
+        if stream.sent and not stream.arrived and self._recording.log.outcome is not None:
+            self._bench.devices[role].close()
+            self._compare_requests(role)
+        else:
+            self._poll(role)
+        if stream.decoded and not self._recording.problem:
+            topic = next(topic for topic, of in SAMPLES.items() if of == role)
+            raise self._different(role, "sample", "no sample", _in_words(topic, stream.decoded[0]))
+
+    def _different(self, role: str, kind: str, recorded: str, decoded: str) -> _Different:
+        stream = self._streams[role]
+        step = self._recording.step_at(stream.t)
+        return _Different(Difference(role, kind, stream.t, step, stream.offset, bytes(stream.since), recorded, decoded))
+
+
+def _commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]], None]]:
+    """What the commands of a log mean, by device and word."""
+
+    def arm(values: Sequence[float]) -> None:
+        supply().set_ramp(values[0])
+        if len(values) > 1:
+            supply().set_current_limit(values[1])
+
+    def supply() -> HVSupply:
+        assert bench.hv is not None
+        return bench.hv
+
+    def stage() -> Stage:
+        return bench.stage
+
+    return {
+        ("stage", "home"): lambda values: stage().home(),
+        ("stage", "move_to"): lambda values: stage().move_to(values[0], values[1]),
+        ("stage", "stop"): lambda values: stage().stop(),
+        ("hv", "arm"): arm,
+        ("hv", "set_voltage"): lambda values: supply().set_voltage(values[0]),
+        ("hv", "switch_on"): lambda values: supply().switch_on(),
+        ("hv", "switch_off"): lambda values: supply().switch_off(),
+        ("hv", "emergency_off"): lambda values: supply().emergency_off(),
+    }
+
+
+def _in_words(topic: str, payload: bytes) -> str:
+    return ", ".join(f"{name} {value!r}" for name, value in schema.decode(topic, payload).items())
+
+
+def _hex(messages: Sequence[bytes]) -> str:
+    return messages[0].hex(" ") if messages else "no request"
