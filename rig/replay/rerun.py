@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from rig.bench import Bench
+from rig.control import Answer, Control
 from rig.engine import Engine, Outcome
 from rig.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench
 from rig.replay.recording import Recording
-from rig.signals import StopRequest
 
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
 
 # Of the outcome of a run in real time; its measured values and times come out a little different each time.
 SAME_IN_REAL_TIME = ("status", "safe", "stage_standing")
+AS_RECORDED = "as in the log"
 
 
 @dataclass(frozen=True)
@@ -67,16 +70,19 @@ class Rerun:
 def rerun(recording: Recording) -> Rerun:
     """Run the recorded experiment again, answered from its log."""
     experiment = recording.experiment
-    replay = ReplayBench(recording)
+    operator = _Operator(recording)
+    replay = _Again(recording, operator)
     bench = Bench(experiment.scene, replay)
     engine = Engine(
         bench,
         experiment.actions,
         cast("LogWriter", _NoLog()),
         gains_of(experiment.certificates),
-        StopRequest(),
+        operator,
         lambda done, total, label: None,
         experiment.certificates,
+        requested=AS_RECORDED,
+        take_down=AS_RECORDED if operator.took_down else "",
     )
     try:
         outcome, _ = engine.run()
@@ -105,6 +111,50 @@ def _disagreements(recording: Recording, outcome: Outcome) -> dict[str, tuple[st
     then, today = recording.log.outcome or {}, outcome.as_text()
     keys = today if recording.in_virtual_time else SAME_IN_REAL_TIME
     return {key: (then.get(key, "-"), today[key]) for key in keys if then.get(key) != today[key]}
+
+
+class _Operator(Control):
+    """The operator of the recorded run: wants again what he wanted then, at the same instants."""
+
+    def __init__(self, recording: Recording) -> None:
+        said = [row.fields for row in recording.rows if row.topic == "/event" and row.fields["source"] == "operator"]
+        given = [row.fields for row in recording.rows if row.topic == "/command"]
+        asked_at = [event["t_s"] for event in said if event["message"].startswith("asked")]
+        answered_at = [event["t_s"] for event in said if event["message"].startswith("answered")]
+        super().__init__(unattended=AS_RECORDED if asked_at == answered_at else "")
+        self.took_down = any((c["device"], c["command"]) == ("hv", "take_down") for c in given)
+        self._wishes = deque((event["t_s"], event["message"].split()[0].rstrip(":")) for event in said)
+        self._stop_at = math.inf
+        outcome = recording.log.outcome or {}
+        self._stopped_by = outcome.get("reason", "").removeprefix("stopped by ")
+        if outcome.get("status") == "stopped":
+            # Making safe begins with the stage, in the same turn.
+            self._stop_at = max((c["t_s"] for c in given if c["command"] == "stop"), default=math.inf)
+
+    def at(self, t: float) -> None:
+        """What he has wanted by ``t``."""
+        while self._wishes and self._wishes[0][0] <= t:
+            match self._wishes.popleft()[1]:
+                case "paused":
+                    self.ask_pause(AS_RECORDED)
+                case "continues":
+                    self.pausing = ""
+                case "answered" if self.question is not None:
+                    self.answer = self.answer or Answer(self.question.expected, AS_RECORDED)
+        if t >= self._stop_at and not self.count:
+            self.ask(self._stopped_by)
+
+
+class _Again(ReplayBench):
+    """A replayed bench with its operator."""
+
+    def __init__(self, recording: Recording, operator: _Operator) -> None:
+        super().__init__(recording)
+        self._operator = operator
+
+    def advance(self, t: float) -> None:
+        super().advance(t)
+        self._operator.at(t)
 
 
 class _NoLog:

@@ -344,6 +344,10 @@ def _commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]],
         if len(values) > 1:
             supply().set_current_limit(values[1])
 
+    def take_down(values: Sequence[float]) -> None:
+        supply().set_ramp(values[0])
+        supply().switch_off()
+
     def supply() -> HVSupply:
         assert bench.hv is not None
         return bench.hv
@@ -356,6 +360,7 @@ def _commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]],
         ("stage", "move_to"): lambda values: stage().move_to(values[0], values[1]),
         ("stage", "stop"): lambda values: stage().stop(),
         ("hv", "arm"): arm,
+        ("hv", "take_down"): take_down,
         ("hv", "set_voltage"): lambda values: supply().set_voltage(values[0]),
         ("hv", "switch_on"): lambda values: supply().switch_on(),
         ("hv", "switch_off"): lambda values: supply().switch_off(),

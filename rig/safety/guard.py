@@ -128,7 +128,7 @@ class Guard:
         self.commanded = True
         self._low_samples = 0
         try:
-            self._tell("take_down", cause)
+            self._tell("take_down", f"ramp {self._ramp!r} V/s; {cause}")
         finally:
             self._supply.set_ramp(self._ramp)
             self._supply.switch_off()
