@@ -134,8 +134,20 @@ def films_of(actuators: Sequence[Actuator], h: Array) -> NDArray[np.object_]:
 
 def balance(actuators: Sequence[Actuator], h: Array, voltage: Array, tolerance: float = 1e-8) -> Balance:
     """Film and bias of every actuator at its row of ``h`` and ``voltage`` (both (actuators, ...))."""
-    film = _solve(actuators, h, voltage, tolerance)
-    push, bias_by_h = forces([one.bias for one in actuators], h)
+    film = solve_films(films_of(actuators, h), h, voltage, kind_of(actuators), tolerance)
+    return weigh(h, voltage, film, *forces([one.bias for one in actuators], h))
+
+
+def kind_of(actuators: Sequence[Actuator]) -> Wrinkling:
+    """The treatment of folds that all of them share."""
+    kinds = {one.wrinkling for one in actuators}
+    if len(kinds) != 1:
+        raise ValueError('the actuators of one call must all be "plain" or all "tension_field"')
+    return kinds.pop()
+
+
+def weigh(h: Array, voltage: Array, film: Solutions, push: Array, bias_by_h: Array) -> Balance:
+    """The balance of solved films with known forces of their biases."""
     assert film.dforce is not None
     slack = film.status == Status.SLACK
     pull = np.where(slack, 0.0, film.force)
@@ -145,26 +157,19 @@ def balance(actuators: Sequence[Actuator], h: Array, voltage: Array, tolerance: 
     return Balance(h, voltage, film, pull, push, by_h, by_voltage, bias_by_h, known)
 
 
-def _solve(actuators: Sequence[Actuator], h: Array, voltage: Array, tolerance: float) -> Solutions:
-    """All films in one call; a state that misses the tolerance asked for is tried once more with a looser one."""
-    kinds = {one.wrinkling for one in actuators}
-    if len(kinds) > 1:
-        raise ValueError('the actuators of one call must all be "plain" or all "tension_field"')
-    (wrinkling,) = kinds
-    films = films_of(actuators, h)
+def solve_films(
+    films: NDArray[np.object_], h: Array, voltage: Array, wrinkling: Wrinkling, tolerance: float
+) -> Solutions:
+    """Solve with derivatives; a state that misses the tolerance asked for is tried once more with a looser one."""
     found = solve_many(films, h, voltage, tolerance=tolerance, wrinkling=wrinkling, sensitivities=True)
     again = found.status == Status.NOT_CONVERGED
-    if tolerance < 1e-6 and again.any():
-        part = solve_many(
-            np.broadcast_to(films, h.shape)[again],
-            h[again] * (1.0 + 1e-10),
-            np.broadcast_to(voltage, h.shape)[again],
-            tolerance=1e-6,
-            wrinkling=wrinkling,
-            sensitivities=True,
-        )
-        found = _patched(found, again, part)
-    return found
+    if tolerance >= 1e-6 or not again.any():
+        return found
+    films, h, voltage = np.broadcast_arrays(films, h, voltage)
+    part = solve_many(
+        films[again], h[again] * (1.0 + 1e-10), voltage[again], tolerance=1e-6, wrinkling=wrinkling, sensitivities=True
+    )
+    return _patched(found, again, part)
 
 
 def _patched(whole: Solutions, where: NDArray[np.bool_], part: Solutions) -> Solutions:

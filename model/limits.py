@@ -59,7 +59,7 @@ def taut_limit(specimen: Specimen, h: ArrayLike, *, tolerance: float = 1e-8) -> 
         share = found.min_hoop_stress / np.where(rest.min_hoop_stress > 0.0, rest.min_hoop_stress, 1.0)
         return np.where(found.answered, share, -1.0)
 
-    voltage, found = _root(specimen, displacement, margin, _slack_voltage(specimen, displacement), tolerance, "plain")
+    voltage, found = _root(specimen, displacement, margin, slack_voltage(specimen, displacement), tolerance, "plain")
     voltage = np.where(taut, voltage, np.where(rest.status == Status.WRINKLED, 0.0, np.nan))
     pulled = taut & (found.min_hoop_stress > 1e-3 * rest.min_hoop_stress)
     field = specimen.material.breakdown_field
@@ -119,7 +119,7 @@ def pull_in_voltage(
     voltage, with the status SLACK where it loses all tension first.
     """
     displacement = np.asarray(h, dtype=float)
-    low, high = np.zeros(displacement.shape), _slack_voltage(specimen, displacement) * (1.0 - 1e-9)
+    low, high = np.zeros(displacement.shape), slack_voltage(specimen, displacement) * (1.0 - 1e-9)
     top = solve_many(specimen, displacement, high, tolerance=1e-6, wrinkling=wrinkling)
     reason = np.asarray(top.status)
     lost = np.where(top.status == Status.UNSTABLE, high, np.inf)  # lowest voltage known to be beyond
@@ -155,7 +155,7 @@ def _where(good: NDArray[np.bool_], voltage: Array, found: Solutions) -> Limit:
     )
 
 
-def _slack_voltage(specimen: Specimen, h: Array) -> Array:
+def slack_voltage(specimen: Specimen, h: Array) -> Array:
     """Voltage at which a straight cone without hoop stress would have no tension left: nothing is taut beyond."""
     m = specimen.material
     mean = np.abs(h) / (specimen.ring_radius - specimen.disk_radius)

@@ -49,3 +49,40 @@ def bracketed(
         if active.size == 0:
             break
     return x
+
+
+def enclosed(
+    function: Callable[[Array, NDArray[np.intp]], Array],
+    low: Array,
+    high: Array,
+    at_low: Array,
+    at_high: Array,
+    tolerance: Array,
+) -> Array:
+    """The same without slopes, by the Illinois method, for functions below zero at ``low``; ends on that side.
+
+    A value that is not a number counts as beyond the root.
+    """
+    low, high = np.array(low, dtype=float), np.array(high, dtype=float)
+    at_low, at_high = np.array(at_low, dtype=float), np.array(at_high, dtype=float)
+    side = np.zeros(low.size)
+    active = np.flatnonzero(high - low > tolerance)
+    for n in range(ROUNDS):
+        if active.size == 0:
+            break
+        left, right, below, above = low[active], high[active], at_low[active], at_high[active]
+        width = right - left
+        share = np.where(np.isfinite(above) & (above > 0.0) & (below < 0.0), below / (below - above), 0.5)
+        # A known sign change is closed in from both sides: a step never leaves less than a part of the tolerance.
+        edge = np.minimum(0.5, 0.4 * tolerance[active] / width)
+        share = np.clip(np.where(n % 4 == 3, 0.5, share), edge, 1.0 - edge)
+        x = left + share * width
+        value = function(x, active)
+        under = value < 0.0
+        last = side[active]
+        at_high[active] = np.where(under, np.where(last < 0.0, 0.5 * above, above), value)
+        at_low[active] = np.where(under, value, np.where(last > 0.0, 0.5 * below, below))
+        low[active], high[active] = np.where(under, x, left), np.where(under, right, x)
+        side[active] = np.where(under, -1.0, 1.0)
+        active = active[high[active] - low[active] > tolerance[active]]
+    return low
