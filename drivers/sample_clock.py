@@ -100,8 +100,10 @@ class SampleClock(Generic[T]):
         """The rate at which samples really come, if it is quite another than the nominal one; then counts anew.
 
         It is another when stalls of half a second and what they dam up cannot explain the samples of the last
-        seconds. Gaps that have been counted do not enter.
+        seconds. Gaps that have been counted do not enter, nor does the time before the first sample.
         """
+        if self._last is None:
+            return None
         elapsed, given = self._now - self._counted_since, self._counted * self._nominal
         slack = max(_STALL_S, 3 * self._nominal)
         if 0.5 * elapsed - slack <= given <= 1.05 * elapsed + slack:

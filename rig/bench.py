@@ -28,6 +28,7 @@ from rig.scene import (
 
 if TYPE_CHECKING:
     from rig.replay.bench import ReplayBench
+    from rig.safety.remote import RemoteGuard
     from rig.sim.bench import SimulatedBench
     from rig.sim.wire import ByteWire, FrameWire
 
@@ -112,6 +113,10 @@ class Bench:
         Virtual when the simulated bench is in memory, real otherwise.
     simulated : SimulatedBench or None
         The bench in memory, with its hidden truth, for tests and for the demonstration's comparison.
+    hv : HVSupply or None
+        The supply in memory. On real ports only ``guard_process`` reaches it.
+    guard_process : RemoteGuard or None
+        The process that owns the supply's link, when there is HV on real ports; `close` ends it.
 
     Parameters
     ----------
@@ -128,6 +133,8 @@ class Bench:
     def __init__(self, scene: Scene, wired: Wired | None = None) -> None:
         self.scene = scene
         self.simulated: SimulatedBench | None = None
+        self.guard_process: RemoteGuard | None = None
+        self.hv = None
         self.clock: Clock
         self._byte_links: dict[str, ByteLink] = {}
         self._frame_links: dict[str, FrameLink] = {}
@@ -144,7 +151,14 @@ class Bench:
 
     def _open_ports(self) -> None:
         self.clock = RealClock()
+        if self.scene.hv is not None:
+            from rig.safety.remote import RemoteGuard
+
+            self.guard_process = RemoteGuard(self.scene, self.clock)
+            self.guard_process.opened()  # first: nobody reads the other ports while its process comes up
         for role, table in self.scene.instruments.items():
+            if table is self.scene.hv:
+                continue
             if isinstance(table, CanTable):
                 from drivers.can_link import CanLink
 
@@ -175,7 +189,6 @@ class Bench:
     def attach(self, tap: Tap) -> None:
         """Put the drivers on their links; from here on they may be polled."""
         self.displacement = None
-        self.hv = None
 
         def bytes_of(role: str) -> ByteLink:
             return TappedByteLink(role, self._byte_links[role], tap, self._when)
@@ -205,16 +218,16 @@ class Bench:
 
                     self.displacement = KeyenceLKG(role, bytes_of(role), **arguments(table, KeyenceLKG))
                     self.devices[role] = self.displacement
-                case IsegTable():
-                    from drivers.iseg_edcp import IsegEDCP
+                case IsegTable() | ShvpsTable():
+                    if self.guard_process is not None:
+                        self.guard_process.attach(tap)
+                        self.devices[role] = self.guard_process
+                    else:
+                        from rig.safety.supply import make_driver
 
-                    self.hv = IsegEDCP(role, frames_of(role), **arguments(table, IsegEDCP))
-                    self.devices[role] = self.hv
-                case ShvpsTable():
-                    from drivers.shvps import Shvps
-
-                    self.hv = Shvps(role, bytes_of(role), **arguments(table, Shvps))
-                    self.devices[role] = self.hv
+                        link = self._byte_links.get(role) or self._frame_links[role]
+                        self.hv = make_driver(table, link, tap, self._when)
+                        self.devices[role] = self.hv
 
     def poll(self, role: str, now: float) -> Sequence[Sample]:
         """New samples of one instrument.
@@ -233,6 +246,8 @@ class Bench:
 
     def link_settings(self, role: str) -> dict[str, str]:
         """What the link of ``role`` set and what its adapter made of it; nothing for links in memory."""
+        if role == "hv" and self.guard_process is not None:
+            return dict(self.guard_process.link_settings)
         link = self._byte_links.get(role) or self._frame_links.get(role)
         return dict(getattr(link, "settings", {}))
 
@@ -241,6 +256,8 @@ class Bench:
         closing = [device.close for device in self.devices.values()]
         closing += [link.close for link in self._byte_links.values()]
         closing += [link.close for link in self._frame_links.values()]
+        if self.guard_process is not None:
+            closing.append(self.guard_process.close)
         for close in closing:
             with suppress(Exception):
                 close()

@@ -26,16 +26,27 @@ class Clock(Protocol):
         """Nanoseconds since 1970 that belong to clock time ``t``."""
         ...
 
+    def calendar_ns(self) -> int:
+        """What the host's calendar says now, nanoseconds since 1970: jumps when somebody sets it."""
+        ...
+
+    def asleep(self) -> float:
+        """Seconds that the host has spent suspended since it was started, where it says so; this clock stood then."""
+        ...
+
 
 class RealClock:
-    """The host's monotonic clock, mapped to the calendar once at the start."""
+    """The host's monotonic clock, mapped to the calendar once at the start.
 
-    def __init__(self) -> None:
-        self._zero = time.monotonic()
-        self._epoch_ns = time.time_ns()
+    ``zero`` and ``started_ns`` of another one make it show the same time in another process of this host.
+    """
+
+    def __init__(self, zero: float | None = None, started_ns: int | None = None) -> None:
+        self.zero = time.monotonic() if zero is None else zero
+        self.started_ns = time.time_ns() if started_ns is None else started_ns
 
     def now(self) -> float:
-        return time.monotonic() - self._zero
+        return time.monotonic() - self.zero
 
     def sleep_until(self, t: float) -> None:
         delay = t - self.now()
@@ -43,7 +54,16 @@ class RealClock:
             time.sleep(delay)
 
     def epoch_ns(self, t: float) -> int:
-        return self._epoch_ns + round(t * 1e9)
+        return self.started_ns + round(t * 1e9)
+
+    def calendar_ns(self) -> int:
+        return time.time_ns()
+
+    def asleep(self) -> float:
+        boot_time = getattr(time, "CLOCK_BOOTTIME", None)  # Linux
+        if boot_time is None:
+            return 0.0
+        return time.clock_gettime(boot_time) - time.clock_gettime(time.CLOCK_MONOTONIC)
 
 
 class VirtualClock:
@@ -53,11 +73,18 @@ class VirtualClock:
     ----------
     advance : callable
         Called with the new time before ``now`` shows it.
+
+    Attributes
+    ----------
+    calendar_step_ns, slept : int, float
+        For tests: how far somebody has set the host's calendar; how long the host was suspended.
     """
 
     def __init__(self, advance: Callable[[float], None] | None = None) -> None:
         self._now = 0.0
         self.advance = advance
+        self.calendar_step_ns = 0
+        self.slept = 0.0
 
     def now(self) -> float:
         return self._now
@@ -71,6 +98,12 @@ class VirtualClock:
 
     def epoch_ns(self, t: float) -> int:
         return VIRTUAL_EPOCH_NS + round(t * 1e9)
+
+    def calendar_ns(self) -> int:
+        return self.epoch_ns(self._now) + self.calendar_step_ns
+
+    def asleep(self) -> float:
+        return self.slept
 
 
 def calendar_now() -> datetime:

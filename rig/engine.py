@@ -20,13 +20,15 @@ from rig.actions import Turns, carry_out, choose_about_live_output, confirm_volt
 from rig.bench import Bench
 from rig.control import Control, Question
 from rig.errors import ConfigError, FaultError, LimitError, RigError, Stopped
+from rig.host import HostTime
 from rig.plan import Action
-from rig.recorder import Gains, Recorder
+from rig.recorder import Gains, Recorder, Severity
+from rig.safety import heartbeat
 from rig.safety.arming import Arming
-from rig.safety.guard import Guard, GuardState
+from rig.safety.guard import AnyGuard, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.teardown import Rest, Teardown
-from rig.watch import Watch
+from rig.watch import Watch, allowed_silence
 
 if TYPE_CHECKING:
     from calibration.certificate import Certificate
@@ -123,7 +125,6 @@ class Engine:
         self.gains = gains
         self.recorder = Recorder(log, self.clock, gains, has_laser=bench.scene.displacement is not None)
         self.limits = Limits.of(bench.scene)
-        self.film = FilmLimits(bench.scene.specimen.specimen(), self.limits)
         self.force_noise = math.nan
         self.listener: Callable[[Sample], None] | None = None
         self.control = control
@@ -133,7 +134,10 @@ class Engine:
         self._actions = actions
         self._progress = progress
         self._certificates = certificates or {}
-        self.guard: Guard | None = None
+        self.guard: AnyGuard | None = None
+        self._host = HostTime(self.clock)
+        self._beats = 0
+        self._next_beat = -math.inf
         self._watch: Watch | None = None
         self._started = self.clock.now()
         self._next_progress = 0.0
@@ -157,7 +161,7 @@ class Engine:
         voltage = 0.0
         if self.guard is not None:
             voltage = self.guard.setpoint
-            self.film.check_path(self.recorder.displacement, h, voltage)
+            self.guard.check_move(self.recorder.displacement, h)
         self.recorder.target(h, voltage, speed)
         self.move_stage(self.recorder.contact + h, speed)
 
@@ -207,7 +211,7 @@ class Engine:
             self.bench.attach(self.recorder.wire)
             self._appoint_guard()
             self._set_up()
-            self._watch = Watch(self.bench, self.recorder, self.limits, self.film, self.guard)
+            self._watch = Watch(self.bench, self.recorder, self.limits, self.guard)
             if self.highest_voltage > 0:
                 self._take_turns(confirm_voltage(self))
             self._carry_out_all()
@@ -233,17 +237,25 @@ class Engine:
         return self._outcome(status, reason, rest), error
 
     def _appoint_guard(self) -> None:
-        supply, table = self.bench.hv, self.bench.scene.hv
-        if supply is None or table is None:
+        scene, process = self.bench.scene, self.bench.guard_process
+        if scene.hv is None:
             return
-        self.guard = Guard(
-            supply,
-            self.limits,
-            self.film,
-            table.ramp_V_per_s,
-            lambda command, argument: self.command("hv", command, argument),
-        )
-        if not supply.measures_current:
+
+        def tell(command: str, argument: str, t: float | None = None) -> None:
+            self.recorder.command("hv", command, argument, t)
+
+        def event(severity: Severity, message: str) -> None:
+            self.recorder.event(severity, "guard", message)
+
+        fresh = {role: age for role, age in allowed_silence(self.bench).items() if role in heartbeat.ROLES}
+        if process is not None:
+            process.appoint(self.gains.voltage, fresh, tell, event)
+            self.guard = process
+        else:
+            assert self.bench.hv is not None
+            film = FilmLimits(scene.specimen.specimen(), self.limits)
+            self.guard = Guard(self.bench.hv, self.limits, film, scene.hv.ramp_V_per_s, tell, fresh)
+        if not scene.hv.measures_current:
             self.recorder.event("warning", "hv", "this supply does not measure its current: nothing watches it")
 
     def _set_up(self) -> None:
@@ -371,10 +383,26 @@ class Engine:
             for sample in self.bench.poll(role, now):
                 self._take(role, sample, now)
         now = self.clock.now()
+        if step := self._host.check():
+            message = f"the host's calendar was set by {step:+.3f} s; this log goes on by the calendar as it was"
+            self.recorder.event("warning", "host", message)
         if self._watch is not None:
             self._watch.turn(now)
+            self._beat(self._watch, now)
         self.recorder.tick(now)
         self.clock.sleep_until(self._next_turn(began))
+
+    def _beat(self, watch: Watch, now: float) -> None:
+        """Tell the guard that this loop turns, and on how fresh data. Nothing else ever does."""
+        guard = self.guard
+        if guard is None:
+            return
+        if now >= self._next_beat:
+            self._next_beat = now + heartbeat.INTERVAL_S
+            self._beats += 1
+            beat = heartbeat.Heartbeat(self._beats, now, self.recorder.displacement, watch.newest_good)
+            guard.heartbeat(beat.encode(), now)
+        guard.turn(now)
 
     def _next_turn(self, now: float) -> float:
         wanted = min(device.next_poll for device in self.bench.devices.values())

@@ -21,9 +21,9 @@ from rig.log.writer import LogWriter
 from rig.plan import Action, Prediction, check_plan, plan
 from rig.protocol import Protocol, load_protocol
 from rig.recorder import Gains
+from rig.safety.guard import ADVICE
 from rig.scene import Scene, load_scene
 from rig.signals import stop_on_signals
-from rig.teardown import ADVICE
 
 # In a log's metadata: on what bench it was. In memory its truth is that of its own scene.
 IN_MEMORY, ON_PORTS = "simulated in memory", "real ports"

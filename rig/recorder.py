@@ -18,6 +18,8 @@ from rig.log.errors import LogError
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
 
+Severity = Literal["info", "warning", "error"]
+
 
 @dataclass(frozen=True)
 class Gains:
@@ -124,11 +126,13 @@ class Recorder:
         """Write bytes as they were on the wire; ``t`` is the time that the driver was told."""
         self._write(f"/raw/{role}/{way}", t, data=data)
 
-    def command(self, device: str, command: str, argument: str) -> None:
-        """Write a command; called before it is given."""
-        self._write("/command", self._clock.now(), device=device, command=command, argument=argument)
+    def command(self, device: str, command: str, argument: str, t: float | None = None) -> None:
+        """Write a command, called before it is given; or at ``t`` by another process, which tells it first."""
+        self._write(
+            "/command", self._clock.now() if t is None else t, device=device, command=command, argument=argument
+        )
 
-    def event(self, severity: Literal["info", "warning", "error"], source: str, message: str) -> None:
+    def event(self, severity: Severity, source: str, message: str) -> None:
         """Write something that a reader of the log should know."""
         self._write("/event", self._clock.now(), severity=severity, source=source, message=message)
 

@@ -15,14 +15,11 @@ from drivers.roles import HVSample
 from rig.bench import Bench
 from rig.control import Control
 from rig.recorder import Recorder
-from rig.safety.guard import SAFE_VOLTAGE, Guard
+from rig.safety.guard import ADVICE, AT_ONCE_S, SAFE_VOLTAGE, AnyGuard
 
-AT_ONCE_S = 5.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
 RAMP_PATIENCE, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
 AGAIN_S = 0.1  # a command that failed is given again at this interval
 LISTEN_S = 2.0  # for a supply that was never commanded: how long to wait for measurements of it
-
-ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class Rest:
 class Teardown:
     """Makes one bench safe. ``guard`` is None when the scene has no HV, or its supply was never reached."""
 
-    def __init__(self, bench: Bench, guard: Guard | None, recorder: Recorder, control: Control) -> None:
+    def __init__(self, bench: Bench, guard: AnyGuard | None, recorder: Recorder, control: Control) -> None:
         self._bench = bench
         self._guard = guard
         self._recorder = recorder

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 
-from drivers.roles import DisplacementSample, ForceSample, HVFlag, HVSample, Sample
+from drivers.roles import DisplacementSample, ForceSample, HVFlag, HVSample, Sample, StageSample
 from rig.bench import Bench
 from rig.errors import FaultError
 from rig.recorder import Recorder
-from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState, flag_names
-from rig.safety.limits import FilmLimits, Limits
+from rig.safety.guard import SAFE_VOLTAGE, AnyGuard, GuardState, flag_names
+from rig.safety.limits import Limits
 
 SILENCE_PERIODS = 10.0  # a sensor silent for this many periods, and longer than two of its time-outs, is a fault
 BAD_SAMPLES = 3  # this many samples in a row that the sensor itself calls bad are a fault
@@ -20,7 +20,6 @@ FROZEN_SAMPLES = 25  # this many equal force readings in a row: an amplifier's l
 DISAGREEMENT_M = 0.5e-3  # between laser and stage, besides what the stage moves in DISAGREEMENT_LAG_S ...
 DISAGREEMENT_LAG_S = 0.05
 DISAGREEMENT_S = 0.25  # ... and for longer than this: one of the two is frozen, or the pusher has slipped
-FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
 # An unloaded sensor may be off by this part of the force limit: beyond it something is wrong with it, and a zero
 # taken there would carry the limit away. Before the zero is taken the limit holds for the reading with that allowance.
 ZERO_PART = 0.25
@@ -32,18 +31,17 @@ class Watch:
     Every method raises `LimitError` or `FaultError`, naming the quantity or device, its value and what is allowed.
     """
 
-    def __init__(self, bench: Bench, recorder: Recorder, limits: Limits, film: FilmLimits, guard: Guard | None) -> None:
+    def __init__(self, bench: Bench, recorder: Recorder, limits: Limits, guard: AnyGuard | None) -> None:
         self._recorder = recorder
         self._limits = limits
-        self._film = film
         self._guard = guard
-        self._silence = _allowed_silence(bench)
+        self._silence = allowed_silence(bench)
         self._newest = dict.fromkeys(bench.devices, bench.clock.now())
+        self.newest_good = dict(self._newest)  # clock time at which each device's newest sample was found good
         self._bad = dict.fromkeys(bench.devices, 0)
         self._last_force = math.nan
         self._equal_forces = 0
         self._agreed = -math.inf
-        self._next_film_check = 0.0
         self._seen_off = False
 
     def sample(self, role: str, sample: Sample, now: float) -> None:
@@ -59,9 +57,11 @@ class Watch:
                     self._limits.displacement.check(self._recorder.quantity_of(sample), "Displacement measured")
             case HVSample():
                 self._judge_output(sample)
+        if isinstance(sample, StageSample) or not sample.flags:
+            self.newest_good[role] = now
 
     def turn(self, now: float) -> None:
-        """Judge what only shows over time: silence, disagreement, and the film under voltage."""
+        """Judge what only shows over time: silence and disagreement."""
         recorder = self._recorder
         for role, allowed in self._silence.items():
             age = now - self._newest[role]
@@ -72,12 +72,6 @@ class Watch:
         if not recorder.has_laser:
             self._limits.displacement.check(recorder.displacement, "Displacement measured")
         self._compare_stage_and_laser(now)
-        if self._guard is not None and self._guard.commanded and now >= self._next_film_check:
-            self._next_film_check = now + FILM_CHECK_S
-            voltage = recorder.hv.voltage if recorder.hv is not None else math.nan
-            h = recorder.displacement
-            if math.isfinite(h):  # else the displacement sensor's own judgement decides
-                self._film.check(h, voltage if not voltage < 0 else 0.0, "Film, as measured")
 
     def _good(self, role: str, sample: ForceSample | DisplacementSample) -> bool:
         """A sensor may call single samples bad, but not several in a row: then nobody knows where the film is."""
@@ -142,7 +136,7 @@ def check_zero(limits: Limits, force_at_zero: float) -> None:
     limits.force.widened(ZERO_PART).check(force_at_zero, "Zero of the force sensor, unloaded")
 
 
-def _allowed_silence(bench: Bench) -> dict[str, float]:
+def allowed_silence(bench: Bench) -> dict[str, float]:
     """Seconds without a sample after which a device counts as silent."""
     scene = bench.scene
     rates = {"stage": scene.stage.poll_rate_Hz, "force": bench.force.rate}

@@ -9,16 +9,26 @@ supply's own current limit and the bleed resistor are.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum, Flag
+from typing import TYPE_CHECKING, TypeAlias
 
 from drivers.roles import HVFlag, HVSample, HVSupply
-from rig.errors import FaultError
+from rig.errors import FaultError, LimitError
+from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limits
+
+if TYPE_CHECKING:
+    from rig.safety.remote import RemoteGuard
+
+AnyGuard: TypeAlias = "Guard | RemoteGuard"  # in the engine's process, or in one of its own
 
 SAFE_VOLTAGE = 60.0  # V; below this the discharge is harmless (EN 50191 names 60 V DC)
 DEVIATION_V, DEVIATION_PART = 50.0, 0.05  # a settled output this far from its set-point has sagged or risen ...
 DEVIATION_SAMPLES = 2  # ... when this many samples in a row say so
+FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
+AT_ONCE_S = 5.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
+ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
 SAFE_SAMPLES = 2  # consecutive measured voltages below SAFE_VOLTAGE before we call the output safe
 
 TRIP = HVFlag.TRIPPED | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.INTERLOCK_OPEN | HVFlag.ARC | HVFlag.FAULT
@@ -46,6 +56,8 @@ class Guard:
         Ramp rate in V/s for every change of the output.
     tell : callable
         ``tell(command, argument)`` is called with each command before it is given, for the log.
+    fresh : mapping of str to float
+        How old the newest good sample of each role may be while armed (s), by the engine's `heartbeat`.
     """
 
     def __init__(
@@ -55,6 +67,7 @@ class Guard:
         film: FilmLimits,
         ramp: float,
         tell: Callable[[str, str], None],
+        fresh: Mapping[str, float] | None = None,
     ) -> None:
         self.state = GuardState.SAFE
         self.cause = "not armed"
@@ -65,6 +78,11 @@ class Guard:
         self._film = film
         self._ramp = ramp
         self._tell = tell
+        self._fresh = dict(fresh or {})
+        self._beat: Heartbeat | None = None
+        self._alive_at: float | None = None  # when the engine last gave a sign of life; None: not yet since arming
+        self._goal = 0.0  # displacement to which the disk is being moved
+        self._next_film_check = -math.inf
         self._low_samples = 0
         self._deviating_samples = 0
         self._seen_on = False
@@ -104,6 +122,7 @@ class Guard:
             self._supply.set_current_limit(self._limits.current.high)
         self.state = GuardState.ARMED
         self.cause = ""
+        self._alive_at = None
         self._seen_on = False
 
     def check_off(self) -> None:
@@ -146,7 +165,8 @@ class Guard:
         if self.state is GuardState.SAFE:
             raise FaultError(f"hv: {volts:g} V refused, the guard is latched safe ({self.cause}).")
         self._limits.voltage.check(volts, "HV set-point")
-        self._film.check(h, volts, f"HV set-point {volts:g} V at {h * 1e3:.2f} mm")
+        for where in (h, self._goal):
+            self._film.check(where, volts, f"HV set-point {volts:g} V at {where * 1e3:.2f} mm")
         self._tell("set_voltage", f"{volts!r} V")
         self.setpoint = volts
         self._supply.set_voltage(volts)
@@ -155,6 +175,85 @@ class Guard:
             self._supply.switch_on()
             self.state = GuardState.LIVE
         self._low_samples = 0
+
+    def check_move(self, h0: float, h1: float) -> None:
+        """Ask before the disk is moved from displacement ``h0`` to ``h1`` metres.
+
+        Raises
+        ------
+        LimitError
+            When field or tension would be outside their limits somewhere on the way, at the voltage that is on.
+        """
+        self._film.check_path(h0, h1, self._voltage)
+        self._goal = h1
+
+    def heartbeat(self, data: bytes, now: float) -> None:
+        """Take in one sign of life of the engine's loop, as `Heartbeat.encode` gives it.
+
+        Raises
+        ------
+        FaultError
+            Damaged, repeated, or one is missing before it; the output has been taken off at once then.
+        """
+        try:
+            beat = Heartbeat.decode(data)
+            last = self._beat.counter if self._beat is not None else 0
+            if beat.counter != last + 1:
+                raise ValueError(f"it is number {beat.counter} after {last}")
+        except ValueError as error:
+            raise self._off(f"the engine's heartbeat cannot be believed: {error}", at_once=True) from None
+        self._beat = beat
+        self._alive_at = now
+
+    def turn(self, now: float) -> None:
+        """Judge what only shows over time: the engine's life, the age of its data, the film as measured.
+
+        Raises
+        ------
+        FaultError
+            The engine has been silent for longer than `DEADLINE_S`: off at once. A sensor's newest good sample is too
+            old: ramped down.
+        LimitError
+            Field or tension at the measured displacement is outside its limits: off at once.
+        """
+        if self.state is not GuardState.SAFE:
+            self._judge_engine(now)
+        h = self._beat.displacement if self._beat is not None else math.nan
+        live = self.commanded and not self.output_is_safe
+        if live and now >= self._next_film_check and math.isfinite(h):  # else the sensor's own judgement decides
+            self._next_film_check = now + FILM_CHECK_S
+            try:
+                self._film.check(h, self._voltage, "Film, as measured")
+            except LimitError as error:
+                self.kill(str(error))
+                raise
+
+    def _judge_engine(self, now: float) -> None:
+        if self._alive_at is None:
+            self._alive_at = now
+        silent = now - self._alive_at
+        if not silent <= DEADLINE_S:
+            raise self._off(f"the engine has been silent for {silent * 1e3:.0f} ms", at_once=True)
+        if self._beat is None:
+            return
+        for role, allowed in self._fresh.items():
+            age = now - self._beat.samples.get(role, math.nan)
+            if not age <= allowed:
+                raise self._off(f"the newest good sample of {role} is {age:.2f} s old", at_once=False)
+
+    @property
+    def _voltage(self) -> float:
+        """The higher of what is set and what is measured."""
+        measured = self.last.voltage if self.last is not None else 0.0
+        return max(self.setpoint, measured if measured > 0 else 0.0)
+
+    def _off(self, cause: str, *, at_once: bool) -> FaultError:
+        """Take the output off and give back the error that says so."""
+        if at_once:
+            self.kill(cause)
+        else:
+            self.ramp_off(cause)
+        return FaultError(f"hv: {cause}; the guard took the output off.")
 
     def on_sample(self, sample: HVSample) -> None:
         """Judge one measurement of the output.

@@ -175,3 +175,10 @@ def test_the_first_block_ends_at_its_arrival() -> None:
         (pytest.approx(6.9), "b"),
         (pytest.approx(7.0), "c"),
     ]
+
+
+def test_the_time_before_the_first_sample_says_nothing_of_the_rate() -> None:
+    """An instrument may be set up long after the clock was started."""
+    clock: SampleClock[int] = SampleClock(100.0, {})
+    clock.feed(20.0, [])
+    assert clock.other_rate() is None

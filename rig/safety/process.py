@@ -1,0 +1,316 @@
+"""The guard as a process of its own: sole owner of the high-voltage link, and the last one to leave.
+
+The engine starts it when a scene with high voltage runs on real ports. It opens the link, holds the limits and the
+film's model itself, and runs its own loop. It executes set-points only while the engine's heartbeats arrive. The
+engine's death closes the socket between them: the output is then taken off at once. A hung engine misses its deadline:
+the same. Off is believed when it has been *measured*; a supply that does not obey is called NOT SAFE, told again for
+`TRY_S`, and left to the operator.
+
+Ctrl-C, SIGTERM and SIGHUP do not concern this process: its life is bound to the socket. When *both* processes are
+killed, or the computer loses its power, nothing in software is left to act, and the supply keeps its voltage: that case
+belongs to the hardware, to interlock loop, emergency stop and bleed resistor.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import sys
+from contextlib import suppress
+from dataclasses import replace
+from typing import Literal
+
+import click
+
+from drivers.link import DeviceError
+from drivers.roles import HVSample, HVSupply
+from rig.clock import RealClock
+from rig.errors import FaultError, LimitError
+from rig.host import HostTime
+from rig.safety.channel import Channel, ChannelDamaged, Message
+from rig.safety.guard import ADVICE, AT_ONCE_S, SAFE_VOLTAGE, Guard, GuardState
+from rig.safety.limits import FilmLimits, Limits
+from rig.safety.supply import Link, SupplyTable, make_driver, open_link
+from rig.scene import Scene
+
+SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005
+STATE_S = 0.05  # how often the engine hears from us at least
+AGAIN_S = 0.1  # a command that failed is given again at this interval
+INSIST_S = 1.0  # an off that was sent but is not measured is sent again at this interval
+TRY_S = 20.0  # how long a supply that does not obey is told again after the engine has gone
+IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
+MAY_BE_CALLED = ("arm", "check_off", "request", "check_move", "take_down", "ramp_off", "kill")
+
+
+def config(scene: Scene, clock: RealClock) -> bytes:
+    """What the guard process needs to know, as JSON."""
+    content = {"scene": scene.model_dump(mode="json", exclude_none=True), "zero": clock.zero, "ns": clock.started_ns}
+    return json.dumps(content).encode()
+
+
+def serve(end: socket.socket, configured: bytes) -> None:
+    """The life of the guard process, from opening the link to its end.
+
+    Parameters
+    ----------
+    end : socket
+        Our end of the pair; the engine holds the other one, and nobody else.
+    configured : bytes
+        From `config`.
+    """
+    _detach()
+    known = json.loads(configured)
+    channel = Channel(end)
+    scene = Scene.model_validate(known["scene"])
+    assert scene.hv is not None
+    try:
+        link = open_link(scene.hv)
+    except Exception as error:
+        channel.send({"is": "error", "error": pack_error(error)})
+        return
+    clock = RealClock(known["zero"], known["ns"])
+    server = Server(scene, scene.hv, link, channel, clock)
+    try:
+        server.run()
+    finally:
+        link.close()
+        channel.close()
+
+
+def _detach() -> None:
+    """Out of reach of the terminal: what is typed there, and its end, are the engine's business."""
+    for name in IGNORED:
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    if os.name == "posix":
+        os.setsid()
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())
+
+
+class Server:
+    """Runs the guard's loop until the engine closes the channel and the output has been taken care of."""
+
+    def __init__(self, scene: Scene, table: SupplyTable, link: Link, channel: Channel, clock: RealClock) -> None:
+        self._scene = scene
+        self._table = table
+        self._link = link
+        self._channel = channel
+        self._clock = clock
+        self._host = HostTime(clock)
+        self._supply: HVSupply | None = None
+        self._guard: Guard | None = None
+        self._gain = 1.0
+        self._polled_at = 0.0
+        self._next_state = 0.0
+        self._again = 0.0
+        self._off_at: float | None = None  # when the output was first taken off
+        self._told_not_safe = False
+        self._dismissed = False
+
+    def run(self) -> None:
+        settings = dict(getattr(self._link, "settings", {}))
+        self._channel.send({"is": "opened", "settings": settings})
+        while not self._channel.closed and not self._dismissed:
+            try:
+                self._turn()
+            except Exception as error:  # whatever it is, the output goes off first
+                self._fault(error)
+            self._wait()
+        if self._guard is not None and self._guard.commanded and not self._dismissed:
+            self._leave(self._guard)
+
+    # The loop ------------------------------------------------------------------------------------------------
+
+    def _turn(self) -> None:
+        # First everything that has arrived: a guard that was held up must not blame the engine for it.
+        for message in self._receive():
+            self._obey(message)
+        guard, supply = self._guard, self._supply
+        if guard is None or supply is None:
+            return
+        self._poll(guard, supply)
+        now = self._clock.now()
+        guard.turn(now)
+        self._host.check()
+        self._insist(guard, now)
+        if now >= self._next_state:
+            self._tell_state(guard, supply, now)
+
+    def _receive(self) -> list[Message]:
+        try:
+            return self._channel.receive()
+        except ChannelDamaged as error:
+            raise FaultError(f"hv: the guard cannot understand the engine: {error}.") from None
+
+    def _poll(self, guard: Guard, supply: HVSupply) -> None:
+        self._polled_at = self._clock.now()  # all the time that the driver knows: what passes on its wire bears it
+        for raw in supply.poll(self._polled_at):
+            assert isinstance(raw, HVSample)
+            self._channel.send(
+                {"is": "sample", "values": [raw.t, raw.voltage, raw.current, raw.setpoint, raw.flags.value]}
+            )
+            self._next_state = 0.0
+            guard.on_sample(self._by_certificate(raw))
+
+    def _by_certificate(self, sample: HVSample) -> HVSample:
+        return replace(sample, voltage=sample.voltage * self._gain)
+
+    def _wait(self) -> None:
+        now = self._clock.now()
+        due = self._supply.next_poll if self._supply is not None else now + LONGEST_TURN_S
+        wait = min(max(due - now, SHORTEST_TURN_S), LONGEST_TURN_S)
+        if self._channel.closed:
+            self._clock.sleep_until(now + wait)
+        else:
+            self._channel.flush()
+            select.select([self._channel], [], [], wait)
+
+    def _fault(self, error: Exception) -> None:
+        guard = self._guard
+        if guard is not None and guard.state is not GuardState.SAFE:
+            self._off(guard, str(error) or repr(error))
+        elif guard is not None and self._off_at is not None and isinstance(error, DeviceError):
+            self._again = min(self._again, self._clock.now() + AGAIN_S)
+        self._channel.send({"is": "error", "error": pack_error(error)})
+
+    def _off(self, guard: Guard, cause: str) -> None:
+        """Take the output off and send that in this very turn."""
+        self._note_off(guard)
+        try:
+            guard.kill(cause)
+            if self._supply is not None:
+                self._poll(guard, self._supply)
+        except Exception as error:
+            self._channel.send({"is": "error", "error": pack_error(error)})
+
+    def _note_off(self, guard: Guard) -> None:
+        """An off is on its way: from now on it has to show in what is measured."""
+        if guard.commanded:
+            now = self._clock.now()
+            self._off_at = now if self._off_at is None else self._off_at
+            self._again = now + INSIST_S
+
+    def _insist(self, guard: Guard, now: float) -> None:
+        """Off is what was measured: until then it is sent again, and after a while called by its name."""
+        if self._off_at is None:
+            return
+        if guard.output_is_safe:
+            self._off_at = None
+        elif now - self._off_at > AT_ONCE_S and not self._told_not_safe:
+            self._told_not_safe = True
+            message = f"NOT SAFE: the output was not measured below {SAFE_VOLTAGE:.0f} V. {ADVICE}"
+            self._channel.send({"is": "event", "severity": "error", "message": message})
+            _say(f"dea-rig guard: {message}")
+        elif now >= self._again:
+            self._off(guard, guard.cause)
+
+    # What the engine asks --------------------------------------------------------------------------------------
+
+    def _obey(self, message: Message) -> None:
+        match message.get("do"):
+            case "heartbeat":
+                if self._guard is not None:
+                    self._guard.heartbeat(bytes.fromhex(message["data"]), self._clock.now())
+            case "call":
+                self._answer(message)
+            case "appoint":
+                self._appoint(message)
+            case "close":
+                self._dismissed = True
+            case other:
+                raise FaultError(f"hv: the engine asks the guard for {other!r}, which it does not know.")
+
+    def _appoint(self, message: Message) -> None:
+        """Put the driver on its link: from here on it is polled."""
+        self._gain = float(message["gain"])
+        self._supply = make_driver(self._table, self._link, self._tell_wire, lambda: self._polled_at)
+        limits = Limits.of(self._scene)
+        film = FilmLimits(self._scene.specimen.specimen(), limits)
+        fresh = {str(role): float(age) for role, age in message["fresh"].items()}
+        self._guard = Guard(self._supply, limits, film, self._table.ramp_V_per_s, self._tell_command, fresh)
+
+    def _answer(self, message: Message) -> None:
+        guard, supply = self._guard, self._supply
+        name, error = message["name"], None
+        try:
+            if guard is None or supply is None:
+                raise FaultError("hv: the guard was asked before it was appointed.")
+            if name not in MAY_BE_CALLED:
+                raise FaultError(f"hv: the guard cannot be asked for {name!r}.")
+            getattr(guard, name)(*message["args"])
+            if name == "kill":
+                self._note_off(guard)
+        except Exception as caught:
+            error = pack_error(caught)
+        if guard is not None and supply is not None:
+            self._tell_state(guard, supply, self._clock.now())
+        self._channel.send({"is": "answer", "n": message["n"], "error": error})
+
+    # What the engine is told -----------------------------------------------------------------------------------
+
+    def _tell_state(self, guard: Guard, supply: HVSupply, now: float) -> None:
+        self._next_state = now + STATE_S
+        self._channel.send(
+            {
+                "is": "state",
+                "state": guard.state.value,
+                "cause": guard.cause,
+                "commanded": guard.commanded,
+                "setpoint": guard.setpoint,
+                "output_is_safe": guard.output_is_safe,
+                "ramp_duration": guard.ramp_duration,
+                "ready": supply.ready,
+                "identity": [supply.identity.model, supply.identity.serial, supply.identity.firmware],
+                "settings": supply.settings,
+                "counters": supply.counters,
+            }
+        )
+
+    def _tell_wire(self, role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:
+        self._channel.send({"is": "wire", "way": way, "data": data.hex(), "t": t})
+
+    def _tell_command(self, command: str, argument: str) -> None:
+        self._channel.send({"is": "command", "command": command, "argument": argument, "t": self._clock.now()})
+
+    # The end ---------------------------------------------------------------------------------------------------
+
+    def _leave(self, guard: Guard) -> None:
+        """The engine has gone without taking leave, from a supply that it had commanded."""
+        cause = "the engine has ended without taking leave"
+        began = self._clock.now()
+        if guard.state is GuardState.SAFE and guard.output_is_safe:
+            cause = f"{cause}; before that: {guard.cause}"
+        else:
+            self._off(guard, cause)
+        while not guard.output_is_safe and self._clock.now() - began < TRY_S:
+            try:
+                assert self._supply is not None
+                self._poll(guard, self._supply)
+                self._insist(guard, self._clock.now())
+            except Exception as error:
+                self._fault(error)
+            self._wait()
+        measured = guard.last.voltage if guard.last is not None else float("nan")
+        if guard.output_is_safe:
+            _say(f"dea-rig guard: {cause}. The high voltage is off, measured {measured:.0f} V.")
+        else:
+            _say(f"dea-rig guard: {cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {ADVICE}")
+
+
+def _say(text: str) -> None:
+    """To the terminal, if there still is one."""
+    with suppress(OSError, ValueError):
+        click.echo(text, err=True)
+        sys.stderr.flush()
+
+
+def pack_error(error: Exception) -> Message:
+    """An error as plain text and numbers."""
+    if isinstance(error, DeviceError):
+        return {"kind": type(error).__name__, "device": error.device, "what": error.what, "advice": error.advice}
+    kind = type(error).__name__ if isinstance(error, LimitError | FaultError) else "FaultError"
+    text = str(error) if isinstance(error, LimitError | FaultError) else f"hv: internal error of the guard: {error!r}"
+    return {"kind": kind, "text": text}
