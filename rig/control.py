@@ -137,7 +137,7 @@ class Control(StopRequest):
                 return "The run is paused already."
             self.ask_pause(source)
             return "Pausing: the stage stops, the voltage ramps to zero."
-        if self.question is not None and self.answer is None:
+        if self.question is not None and self.answer is None:  # the loop takes the answer at its next turn
             if self.question.expected and text != self.question.expected:
                 return f"That is not what is asked for: type {self.question.expected}, or s to stop."
             self.answer = Answer(text, source)
@@ -151,8 +151,8 @@ class Control(StopRequest):
 
     def describe(self) -> dict[str, str]:
         """The state of the run for another terminal."""
-        state = "ending" if self.count else "asking" if self.question else "paused" if self.pausing else "running"
-        question = self.question
+        question = self.question if self.answer is None else None
+        state = "ending" if self.count else "asking" if question else "paused" if self.pausing else "running"
         return {
             "state": state,
             "doing": self.doing,
@@ -193,8 +193,7 @@ class Keyboard:
             if not select.select([self._fd], [], [], 0)[0]:
                 return []
             data = os.read(self._fd, 4096)
-        except OSError:
-            self._open = False
+        except OSError:  # not our terminal any more, or not now
             return []
         self._open = bool(data)  # Ctrl-D, or the terminal is gone
         *lines, self._rest = (self._rest + data).split(b"\n")

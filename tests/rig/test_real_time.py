@@ -108,3 +108,58 @@ def test_a_signal_ends_a_run_safely(scene: Path, ports: Path, tmp_path: Path, nu
     assert "high voltage off" in err
     outcome = read_log(log).outcome
     assert outcome is not None and outcome["status"] == "stopped" and outcome["safe"] == "yes"
+
+
+@pytest.mark.slow
+def test_a_run_is_paused_continued_and_stopped_from_another_terminal(
+    scene: Path, ports: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rig.log.reader import read_log
+
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    log, slow = tmp_path / "run.mcap", tmp_path / "slow.toml"
+    slow.write_text(
+        (FIXTURES / "protocols/short.toml")
+        .read_text()
+        .replace("= 6.0\nspeed_mm_per_s = 4.0", "= 6.0\nspeed_mm_per_s = 1.0")
+        .replace("[0, 800]", "[800]")
+    )
+    with dea_rig("run", scene, slow, "-o", log, "--ports", ports, "--arm") as run:
+        try:
+            assert run.stderr is not None
+
+            said: list[str] = []
+
+            def wait_for(words: str) -> None:
+                for line in run.stderr or ():
+                    said.append(line)
+                    if words in line:
+                        return
+                raise AssertionError(f"never said: {words}; but: {said}")
+
+            wait_for("High voltage up to 800 V")
+            assert "Answered" in other_terminal("continue", "800\n")
+            wait_for("0 to 6 mm at 800 V")
+            run.send_signal(signal.SIGTSTP)  # Ctrl-Z does not freeze it: it pauses
+            wait_for("Paused: the stage stands, the voltage is off")
+            assert "paused already" in other_terminal("pause")
+            assert "Answered" in other_terminal("continue", "800\n")
+            wait_for("0 to 6 mm at 800 V")
+            assert "The run has ended" in other_terminal("stop")
+            assert run.wait(10) == 130
+        finally:
+            run.kill()
+    told = [m.fields["command"] for m in read_log(log).messages("/command") if m.fields["device"] == "hv"]
+    ramp = ["arm", "set_voltage", "switch_on"]
+    assert told == [*ramp, "switch_off", *ramp, "switch_off"]
+    outcome = read_log(log).outcome
+    assert outcome is not None and outcome["status"] == "stopped" and outcome["safe"] == "yes"
+    assert not list((tmp_path / "dea-rig").iterdir())
+
+
+def other_terminal(word: str, typed: str = "") -> str:
+    """What ``dea-rig WORD`` says, with ``typed`` typed into it."""
+    command = [sys.executable, "-m", "rig", word]
+    done = subprocess.run(command, input=typed, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
