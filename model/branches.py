@@ -109,11 +109,11 @@ class _Path:
         grid, problem = self.grid, self.problem
         state = State(point.c[:, None], point.w)
         at = ritz.evaluate(problem, grid, state)
-        r = ritz.reduce(problem, grid, state.w, at)
+        r = ritz.reduce(grid, state.w, at)
         n = len(point.c)
         coupling, give = r.coupling[:, 0], float(r.give[0])
         matrix = np.zeros((n + 1, n + 2))
-        matrix[:n, :n] = r.matrix[:, :, 0] - np.outer(coupling, coupling) / give
+        matrix[:n, :n] = r.matrix[:, :, 0]
         matrix[:n, n] = coupling
         matrix[n, :n] = -coupling
         matrix[n, n] = give
@@ -127,10 +127,9 @@ class _Path:
             matrix[n, n + 1] = -float((grid.once * r.hw * rate).sum())
         else:
             matrix[n, n + 1] = -self.full_height
-        # reduce() gives the residual with lam0 in it; take it apart again.
         residual = np.empty(n + 1)
-        residual[:n] = -r.rhs[:, 0] - float(r.lam0[0]) * coupling + point.lam * coupling
-        residual[n] = give * (point.lam - float(r.lam0[0]))
+        residual[:n] = r.residual[:, 0] + point.lam * coupling
+        residual[n] = float((r.reach - problem.height)[0]) + give * point.lam
         return matrix, residual, at, r, rate
 
     def slopes(self, point: _Point, change: Array, at: ritz.Points, r: ritz.Reduced, rate: Array) -> Array:
@@ -179,7 +178,7 @@ class _Path:
     def finish(self, point: _Point, before: Array | None) -> _Point:
         matrix, _, _, r, _ = self.system(point)
         point.tangent = self.tangent(matrix, before)
-        lowest = float(np.linalg.eigvalsh(r.matrix[:, :, 0])[0])
+        lowest = float(np.linalg.eigvalsh(r.condensed()[:, :, 0])[0])
         point.stable = lowest > 0.0 and bool(r.positive[0])
         return point
 

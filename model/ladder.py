@@ -41,6 +41,19 @@ class Iterate:
     steps: NDArray[np.intp]
     hoop: Array | None = None  # least hoop over largest meridional stress at the points, before the last step
 
+    def put(self, index: NDArray[np.intp], other: Iterate) -> None:
+        """Take over other iterates of the states at ``index``."""
+        if other.grid.breaks is not self.grid.breaks:
+            breaks = self.grid.breaks.copy()
+            breaks[:, index] = other.grid.breaks
+            self.grid = Grid.lay(self.grid.table.modes, breaks)
+        self.state.put(index, other.state)
+        for name in ("lam", "change", "tail", "stable", "ok", "hoop"):
+            values = getattr(self, name)
+            if values is not None:
+                values[index] = getattr(other, name)
+        self.steps[index] += other.steps
+
 
 Settle = Callable[[Problem, Grid, State, float], Iterate]
 
@@ -75,9 +88,9 @@ def advance(state: State, step: ritz.Step, at: ritz.Points, grid: Grid) -> tuple
     Where the tension is a small rest of elastic and Maxwell stress, the force feels the change that much more.
     """
     w = state.w
-    change = np.abs(step.dw / w).max(axis=(0, 1))
+    change = np.abs(step.dw / w).max(axis=(0, 1), initial=0.0)
     if at.law.maxwell is not None:
-        change *= np.sqrt(np.maximum(1.0, np.abs(at.law.maxwell / at.law.t1).max(axis=(0, 1))))
+        change *= np.sqrt(np.abs(at.law.maxwell / at.law.t1).max(axis=(0, 1), initial=1.0))
     short: Array | float = 1.0
     if not change.max() <= 0.8:
         short = np.where(change > 2.0, 2.0 / change, 1.0)
@@ -114,28 +127,18 @@ def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
         at = ritz.evaluate(problem, grid, state)
         step = ritz.newton(problem, grid, state, at)
         state, change = advance(state, step, at, grid)
-        lam = step.lam
-        stable = step.stable
-        if at.law.relief is not None:
-            stable = stable & at.law.relief.regular.all(axis=(0, 1))
         steps += 1
         done = change <= goal
-        if done.all() or n >= limit:
+        rest = np.flatnonzero(~done)
+        if len(rest) == 0 or n >= limit or (n >= 4 and len(rest) < 0.5 * states):
             break
-        if n >= 4 and states > 1 and done.mean() > 0.5:
-            rest = np.flatnonzero(~done)
-            ends = tail(problem, grid, state, step)
-            hoop = at.law.t2.min(axis=(0, 1)) / at.law.t1.max(axis=(0, 1))
-            more = newton(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n)
-            state.put(rest, more.state)
-            lam[rest], change[rest], stable[rest], ends[rest] = more.lam, more.change, more.stable, more.tail
-            steps[rest] += more.steps
-            hoop[rest] = more.hoop
-            ok = (change <= goal) & stable & (lam > 0.0)
-            return Iterate(grid, state, lam, change, ends, stable, ok, steps, hoop)
     ends = tail(problem, grid, state, step)
     hoop = at.law.t2.min(axis=(0, 1)) / at.law.t1.max(axis=(0, 1))
-    return Iterate(grid, state, lam, change, ends, stable, done & stable & (lam > 0.0), steps, hoop)
+    ok = done & step.stable & (step.lam > 0.0)
+    result = Iterate(grid, state, step.lam, change, ends, step.stable, ok, steps, hoop)
+    if 0 < len(rest) < states and n < limit:
+        result.put(rest, newton(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n))
+    return result
 
 
 @dataclass(slots=True)
@@ -171,6 +174,10 @@ class Start:
 
     grid: Grid
     state: State
+
+    def take(self, index: ritz.Index) -> Start:
+        """The states at ``index``."""
+        return Start(self.grid.take(index), self.state.take(index))
 
 
 def refine(start: Start, problem: Problem, modes: int) -> Start:
@@ -208,12 +215,12 @@ def climb(
     *,
     sensitivities: bool = False,
     settle: Settle = newton,
-    taut: bool = False,
+    folded: list[tuple[NDArray[np.intp], Start]] | None = None,
 ) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
     """Solve a block of states to ``tolerance`` (relative, force), each with the resolution that it needs.
 
-    With ``taut`` a state whose hoop stress is clearly negative is given up at once. Returns the answers, the states
-    that have none, and the steps spent on every state.
+    A state whose hoop stress is clearly negative is given up at once where ``folded`` is there to take it. Returns the
+    answers, the states that have none, and the steps spent on every state.
     """
     index = np.arange(len(problem.span))
     total = np.zeros(len(index), dtype=np.intp)
@@ -226,8 +233,14 @@ def climb(
         start = Start(result.grid, result.state)
         total[index] += result.steps
         lam, ok = result.lam, result.ok
-        if taut and result.hoop is not None:
-            ok &= result.hoop > FOLDED
+        if folded is not None and result.hoop is not None:
+            gone = (result.change <= aim) & (result.hoop <= FOLDED)
+            if gone.any():
+                folded.append((index[gone], start.take(gone)))
+            lost.append(index[~(ok | gone)])
+            ok &= ~gone
+        else:
+            lost.append(index[~ok])
         modes = start.grid.table.modes
         if previous is not None:
             error = estimate(lam, previous, result.change, result.tail, tolerance)
@@ -235,7 +248,7 @@ def climb(
             if len(settled):
                 part = (problem, start, lam)
                 if len(settled) < len(index):
-                    part = (problem.take(settled), _take(start, settled), lam[settled])
+                    part = (problem.take(settled), start.take(settled), lam[settled])
                 answers.append(_answer(*part, sensitivities))
                 answers[-1].index = index[settled]
                 answers[-1].error = error[settled]
@@ -243,21 +256,16 @@ def climb(
             rest = np.flatnonzero(ok & ~(error <= tolerance))
         else:
             rest = np.flatnonzero(ok)
-        lost.append(index[~ok])
         if modes >= MOST_MODES:
             lost.append(index[rest])
             break
         if len(rest) == 0:
             break
         if len(rest) < len(index):
-            problem, index, start, lam = problem.take(rest), index[rest], _take(start, rest), lam[rest]
+            problem, index, start, lam = problem.take(rest), index[rest], start.take(rest), lam[rest]
         previous = lam
         start = refine(start, problem, next_modes(modes))
     return answers, np.concatenate(lost), total
-
-
-def _take(start: Start, index: ritz.Index) -> Start:
-    return Start(start.grid.take(index), start.state.take(index))
 
 
 def _answer(problem: Problem, start: Start, lam: Array, sensitivities: bool) -> Answer:

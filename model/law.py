@@ -62,7 +62,7 @@ class Film:
         if self.mu.shape[1] == 1:
             if self._weights is None:
                 self._weights = np.stack((self.mu[:, 0], self.mu[:, 0] * self.alpha[:, 0]))
-            both = (self._weights @ powers.reshape(len(powers), -1)).reshape((2, *powers.shape[1:]))
+            both = (self._weights @ powers.reshape(len(powers), powers[0].size)).reshape((2, *powers.shape[1:]))
             stress, modulus = both[0], both[1]
         else:
             stress = self.mu[0] * powers[0]

@@ -457,28 +457,36 @@ class _Block:
         breaks = problem.cut()
         grid = Grid.lay(first_modes(float(problem.span.max()) / (len(breaks) - 1), tolerance), breaks)
         start = Start(grid, ritz.guess(problem, grid))
-        answers, lost, steps = climb(problem, tolerance, start, sensitivities=sensitivities, taut=relaxed)
-        doubtful = [lost]
-        folded = [lost] if relaxed else []
+        folded: list[tuple[NDArray[np.intp], Start]] = []
+        answers, lost, steps = climb(
+            problem, tolerance, start, sensitivities=sensitivities, folded=folded if relaxed else None
+        )
+        doubtful = [] if relaxed else [lost]
         for answer in answers:
             x = answer.extremes
             soft = x.softening > SOFTENING
             wrinkled = x.hoop < FLAT * x.meridional if relaxed else np.zeros_like(soft)
             doubtful.append(answer.index[soft & ~wrinkled])
-            folded.append(answer.index[wrinkled])
+            if wrinkled.any():
+                folded.append((answer.index[wrinkled], Start(answer.grid, answer.state).take(wrinkled)))
             self.place(result, index, answer, ~(soft | wrinkled))
         if relaxed:
-            doubtful = doubtful[1:]
-            some = np.concatenate(folded)
-            if len(some):
-                answers, lost, spent = tension_field.solve(problem.take(some), tolerance, sensitivities=sensitivities)
+
+            def relax(some: NDArray[np.intp], begin: Start | None) -> NDArray[np.intp]:
+                answers, lost, spent = tension_field.solve(
+                    problem.take(some), tolerance, sensitivities=sensitivities, begin=begin
+                )
                 steps[some] += spent
-                doubtful.append(some[lost])
                 for answer in answers:
                     soft = answer.extremes.softening > SOFTENING
                     answer.index = some[answer.index]
                     doubtful.append(answer.index[soft])
                     self.place(result, index, answer, ~soft)
+                return some[lost]
+
+            # Folds begin where the plain equations put them; what this does not settle begins with a search.
+            some = np.concatenate([lost, *(relax(*begun) for begun in folded)])
+            doubtful.append(relax(some, None) if len(some) else some)
         some = np.concatenate(doubtful)
         if len(some):
             self.follow(result, index, problem, some, steps, tolerance, relaxed, sensitivities)
@@ -506,7 +514,9 @@ class _Block:
             return
         here, grid, state = part.take(good), path.grid.take(good), path.state.take(good)
         if relaxed:
-            answers, _, spent = tension_field.solve(here, tolerance, sensitivities=sensitivities, begin=(grid, state))
+            answers, _, spent = tension_field.solve(
+                here, tolerance, sensitivities=sensitivities, begin=Start(grid, state)
+            )
         else:
             answers, _, spent = climb(here, tolerance, Start(grid, state), sensitivities=sensitivities)
         steps[some[good]] += spent

@@ -48,6 +48,9 @@ class Table:
     square: NDArray[np.intp]  # (N+2, N+2): where each entry of the matrix stands among the pairs
     ends: Array  # (2, Q): extrapolation to xi = -1 and xi = 1
     end_slopes: Array  # (2, Q): derivative there
+    to_legendre: Array  # (Q, Q): Legendre coefficients of the polynomial through the points
+    integrate: Array  # (Q, Q): integral from -1 to each point
+    to_modes: Array  # (N, Q): modes of a function whose derivative is given
 
 
 @lru_cache(maxsize=64)
@@ -94,6 +97,10 @@ def table(modes: int) -> Table:
     slope = 0.5 * n * (n + 1.0)
     to_legendre = (legendre[:, :points] * weight[:, None] * (n + 0.5)).T
     end_slopes = np.stack(((-1.0) ** (n + 1.0) * slope, slope)) @ to_legendre
+    # The integral of P_n from -1 is (P_(n+1) - P_(n-1))/(2n + 1), of P_0 it is P_1 + P_0.
+    integrals = np.empty((points, points))
+    integrals[:, 0] = xi + 1.0
+    integrals[:, 1:] = (legendre[:, 2:] - legendre[:, : points - 1]) / (2.0 * n[1:] + 1.0)
     return Table(
         modes=modes,
         points=points,
@@ -105,6 +112,9 @@ def table(modes: int) -> Table:
         square=square,
         ends=barycentric(xi, np.array([-1.0, 1.0])),
         end_slopes=end_slopes,
+        to_legendre=to_legendre,
+        integrate=integrals @ to_legendre,
+        to_modes=np.ascontiguousarray((dphi[:, :modes] * weight[:, None]).T),
     )
 
 
@@ -115,14 +125,18 @@ def transfer(old: int, new: int) -> Array:
 
 
 @lru_cache(maxsize=256)
-def places(modes: int, elements: int) -> NDArray[np.intp]:
-    """(M, N+2): the unknown that each function of each element belongs to; one past the last where there is none."""
-    out = np.empty((elements, modes + 2), dtype=np.intp)
-    out[:, :modes] = np.arange(elements * modes).reshape(elements, modes)
-    cuts = elements * modes + np.arange(elements - 1)
-    none = elements * modes + elements - 1
-    out[:, modes] = np.concatenate(([none], cuts))
-    out[:, modes + 1] = np.concatenate((cuts, [none]))
+def places(modes: int, elements: int, some: tuple[int, ...] | None = None) -> NDArray[np.intp]:
+    """(M, N+2): the unknown that each function of ``some`` elements, or of all, belongs to; -1 where there is none.
+
+    The modes of these elements come first, then every cut of the film.
+    """
+    chosen = np.arange(elements) if some is None else np.array(some, dtype=np.intp)
+    bubbles = len(chosen) * modes
+    cuts = np.concatenate(([-1], bubbles + np.arange(elements - 1), [-1]))
+    out = np.empty((len(chosen), modes + 2), dtype=np.intp)
+    out[:, :modes] = np.arange(bubbles).reshape(-1, modes)
+    out[:, modes] = cuts[chosen]
+    out[:, modes + 1] = cuts[chosen + 1]
     return out
 
 
@@ -136,6 +150,7 @@ class Grid:
     once: Array  # weight dx R
     twice: Array  # weight dx R^2
     dxi: Array  # d(xi)/dx, (M, S)
+    place: NDArray[np.intp]  # (M, N+2), see `places`
 
     @classmethod
     def lay(cls, modes: int, breaks: Array) -> Grid:
@@ -146,15 +161,23 @@ class Grid:
         np.exp(radius, out=radius)
         once = t.weight[:, None, None] * half
         once *= radius
-        return cls(t, breaks, radius, once, once * radius, 1.0 / half)
+        return cls(t, breaks, radius, once, once * radius, 1.0 / half, places(modes, len(breaks) - 1))
 
     @property
     def elements(self) -> int:
-        return len(self.breaks) - 1
+        return len(self.place)
 
     @property
     def unknowns(self) -> int:
-        return self.elements * self.table.modes + self.elements - 1
+        return self.elements * self.table.modes + len(self.breaks) - 2
+
+    def part(self, some: tuple[int, ...]) -> Grid:
+        """The elements ``some`` alone, with the same cuts."""
+        place = places(self.table.modes, len(self.breaks) - 1, some)
+        run = slice(some[0], some[0] + len(some)) if some else slice(0, 0)
+        index = run if some == tuple(range(run.start, run.stop)) else list(some)
+        radius, once, twice = (values[:, index] for values in (self.radius, self.once, self.twice))
+        return Grid(self.table, self.breaks, radius, once, twice, self.dxi[index], place)
 
     def take(self, index: Index) -> Grid:
         return Grid(
@@ -164,18 +187,19 @@ class Grid:
             self.once[..., index],
             self.twice[..., index],
             self.dxi[:, index],
+            self.place,
         )
 
     def strain(self, c: Array) -> tuple[Array, Array]:
         """``e = r/R - 1`` and ``q = dr/dR - 1`` (less one, for a change) at the points, from the unknowns (n, S)."""
         t = self.table
         m, states = self.elements, c.shape[1]
-        if m == 1:
+        if m == 1 and len(self.breaks) == 2:
             values = t.values[:, : t.modes] @ c
         else:
             padded = np.concatenate((c, np.zeros((1, states))))
-            local = padded[places(t.modes, m).T]  # (N+2, M, S)
-            values = t.values @ local.reshape(t.modes + 2, -1)
+            local = padded[self.place.T]  # (N+2, M, S)
+            values = t.values @ local.reshape(t.modes + 2, m * states)
         values = values.reshape(2, t.points, m, states)
         e, q = values[0], values[1]
         q *= self.dxi
@@ -189,11 +213,11 @@ class Grid:
         stacked = np.empty((2, *on_e.shape))
         np.add(on_e, on_q, out=stacked[0])
         np.multiply(on_q, self.dxi, out=stacked[1])
-        if m == 1:
+        if m == 1 and len(self.breaks) == 2:
             return t.project[: t.modes] @ stacked.reshape(2 * t.points, states)
-        local = (t.project @ stacked.reshape(2 * t.points, -1)).reshape(t.modes + 2, m, states)
+        local = (t.project @ stacked.reshape(2 * t.points, m * states)).reshape(t.modes + 2, m, states)
         out = np.zeros((self.unknowns + 1, states))
-        for element, place in enumerate(places(t.modes, m)):
+        for element, place in enumerate(self.place):
             out[place] += local[:, element]
         return out[:-1]
 
@@ -208,22 +232,22 @@ class Grid:
         stacked[0] += sum_eq
         sum_eq *= self.dxi
         np.multiply(qq, self.dxi * self.dxi, out=stacked[2])
-        if m == 1:
+        if m == 1 and len(self.breaks) == 2:
             n = t.modes
             products = t.pairs[: n * (n + 1) // 2] @ stacked.reshape(3 * t.points, states)
             return products[t.square[:n, :n]]
-        products = (t.pairs @ stacked.reshape(3 * t.points, -1)).reshape(-1, m, states)
+        products = (t.pairs @ stacked.reshape(3 * t.points, m * states)).reshape(len(t.pairs), m, states)
         n, size = t.modes, self.unknowns
         out = np.zeros((size, size, states))
         for element in range(m):
             own = slice(element * n, (element + 1) * n)
             out[own, own] = products[t.square[:n, :n], element]
-            left, right = m * n + element - 1, m * n + element
+            left, right = self.place[element, n:]
             for hat, cut in ((n, left), (n + 1, right)):
-                if m * n <= cut < size:
+                if cut >= 0:
                     out[own, cut] = out[cut, own] = products[t.square[:n, hat], element]
                     out[cut, cut] += products[t.square[hat, hat], element]
-            if m * n <= left and right < size:
+            if left >= 0 and right >= 0:
                 out[left, right] = out[right, left] = products[t.square[n, n + 1], element]
         return out
 
@@ -336,21 +360,25 @@ class Step:
 
 @dataclass(slots=True)
 class Reduced:
-    """The Newton system after the slopes are eliminated."""
+    """The Newton system after the slopes are eliminated: ``height = reach + give lam - coupling . dc``."""
 
-    matrix: Array  # (n, n, S)
-    rhs: Array  # (n, S)
+    matrix: Array  # (n, n, S) at fixed lam
+    residual: Array  # (n, S), to which lam adds ``lam coupling``
     coupling: Array  # (n, S)
-    give: Array  # (S,): d(h)/d(lam) at fixed c
-    lam0: Array  # (S,)
+    give: Array  # (S,)
+    reach: Array  # (S,)
     hw: Array
     kqw: Array
     kew: Array
     gw: Array
     positive: NDArray[np.bool_]  # (S,): d2W*/dw2 > 0 everywhere
 
+    def condensed(self) -> Array:
+        """The matrix (n, n, S) with the multiplier eliminated: positive definite where the state is stable."""
+        return self.matrix + self.coupling[:, None] * (self.coupling / self.give)[None]
 
-def reduce(problem: Problem, grid: Grid, w: Array, at: Points) -> Reduced:
+
+def reduce(grid: Grid, w: Array, at: Points) -> Reduced:
     """Assemble the Newton system of the modes alone."""
     law, along, down, around = at.law, at.along, at.down, at.around
     tm = law.t1 / at.metric
@@ -378,13 +406,10 @@ def reduce(problem: Problem, grid: Grid, w: Array, at: Points) -> Reduced:
     hg = hw * gw
     residual = grid.project(grid.twice * (law.t2 * around - hg * kew), grid.twice * (law.t1 * along - hg * kqw))
     give = (grid.once * hw / grid.radius).sum(axis=(0, 1))
-    hg -= w
+    np.subtract(w, hg, out=hg)
     hg *= grid.once
-    lam0 = (problem.height + hg.sum(axis=(0, 1))) / give
-    matrix += coupling[:, None] * (coupling / give)[None]
-    residual += lam0 * coupling
-    np.negative(residual, out=residual)
-    return Reduced(matrix, residual, coupling, give, lam0, hw, kqw, kew, gw, kww.min(axis=(0, 1)) > 0.0)
+    positive = kww.min(axis=(0, 1), initial=np.inf) > 0.0
+    return Reduced(matrix, residual, coupling, give, hg.sum(axis=(0, 1)), hw, kqw, kew, gw, positive)
 
 
 FEW = 8  # below this many states elimination is not vectorised over the states
@@ -436,7 +461,7 @@ def _solve_small(matrix: Array, rhs: Array) -> tuple[Array, bool]:
             for i in range(k + 1, n):
                 total -= row[i] * rows[i][j]
             row[j] = total / row[k]
-    return np.array([row[n:] for row in rows]), positive
+    return np.array([row[n:] for row in rows]).reshape(rhs.shape), positive
 
 
 def _solve_large(matrix: Array, rhs: Array) -> tuple[Array, bool]:
@@ -453,11 +478,17 @@ def _solve_large(matrix: Array, rhs: Array) -> tuple[Array, bool]:
 
 def newton(problem: Problem, grid: Grid, state: State, at: Points, *, tangent: bool = False) -> Step:
     """The Newton step at ``state``; with ``tangent`` also the derivative of the state with respect to h/b."""
-    system = reduce(problem, grid, state.w, at)
-    rhs = system.rhs[:, None]
+    return solve(problem, grid, reduce(grid, state.w, at), tangent=tangent)
+
+
+def solve(problem: Problem, grid: Grid, system: Reduced, *, tangent: bool = False) -> Step:
+    """The Newton step that ``system`` asks for."""
+    lam0 = (problem.height - system.reach) / system.give
+    rhs = -(system.residual + lam0 * system.coupling)[:, None]
     if tangent:
-        rhs = np.stack((system.rhs, -system.coupling / system.give), axis=1)
-    solutions, positive = factor_solve(system.matrix, rhs)
+        rhs = np.concatenate((rhs, -(system.coupling / system.give)[:, None]), axis=1)
+    matrix = system.condensed()
+    solutions, positive = factor_solve(matrix, rhs)
 
     def slopes(dc: Array, lam: Array, gradient: Array | float) -> Array:
         de, dq = grid.strain(dc)
@@ -471,8 +502,8 @@ def newton(problem: Problem, grid: Grid, state: State, at: Points, *, tangent: b
         return out
 
     dc = solutions[:, 0]
-    lam = system.lam0 + (system.coupling * dc).sum(axis=0) / system.give
-    diagonal = np.einsum("iis->is", system.matrix)
+    lam = lam0 + (system.coupling * dc).sum(axis=0) / system.give
+    diagonal = np.einsum("iis->is", matrix)
     step = Step(dc, slopes(dc, lam, system.gw), lam, positive & system.positive, diagonal)
     if tangent:
         tc = solutions[:, 1]

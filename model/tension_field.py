@@ -10,6 +10,7 @@ of its distance only, and each step leaves a distance of the square of the last.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,28 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import ladder, ritz
+from model.cone import Cones, Springs, natural_width, whole
 from model.ladder import Answer, Iterate, Start
-from model.law import Array, Stress, relax, stack, stress
+from model.law import Array, stack, stress
+from model.output import FINE, fine_table
 from model.ritz import Grid, Points, Problem, State
 
-FINE = 65  # points of an element where the sign of the hoop stress is read
 START_MODES = 5
 MOST_ZONES = 5
 ROUNDS = 4
 CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
-
-
-def natural_width(problem: Problem, log1: Array, start: Array) -> tuple[Array, Stress]:
-    """``ln l2`` that makes no hoop stress at ``log1``, and the relaxed law there."""
-    everywhere = np.ones(log1.shape, dtype=np.bool_)
-    log2 = start
-    for _ in range(8):
-        law = relax(problem.film, stress(problem.film, stack(log1, log2)), everywhere)
-        assert law.relief is not None
-        log2 = log2 + np.clip(law.relief.change, -0.3, 0.3)
-        if not np.abs(law.relief.change).max() > 1e-6:
-            break
-    return log2, law
 
 
 def guess(problem: Problem, grid: Grid) -> State:
@@ -47,7 +36,7 @@ def guess(problem: Problem, grid: Grid) -> State:
     square = mean * mean
     log1 = 0.5 * np.log1p(square) + problem.log_prestretch
     plain = stress(problem.film, stack(log1, problem.log_prestretch))
-    natural, law = natural_width(problem, log1, problem.log_prestretch - 0.0 * log1)
+    natural, law = natural_width(problem, log1, problem.log_prestretch - 0.0 * log1, 1e-6)
     folded = plain.t2 < 0.0
     t1, h11 = np.where(folded, law.t1, plain.t1), np.where(folded, law.h11, plain.h11)
     part = square / (1.0 + square)
@@ -108,122 +97,142 @@ def zones(grid: Grid, state: State, at: Points, slack: float = 0.0) -> Zones:
     vicinity is round-off.
     """
     tension = at.law.t2 if state.relaxed is None else np.where(state.relaxed, at.hoop - at.log[1], at.law.t2)
-    xi = np.linspace(-1.0, 1.0, FINE)
-    whole = state.relaxed is None or bool((state.relaxed.all(axis=0) | ~state.relaxed.any(axis=0)).all())
+    points, m, states = tension.shape
+    whole = state.relaxed is None or bool((state.relaxed == state.relaxed[:1]).all())
     if whole:
-        flat = ritz.barycentric(grid.table.xi, xi) @ tension.reshape(len(tension), -1)
-        fine = flat.reshape(FINE, *tension.shape[1:]).swapaxes(0, 1)
-        half = 0.5 * (grid.breaks[1:] - grid.breaks[:-1])
-        x = (grid.breaks[:-1] + half)[:, None] + half[:, None] * xi[:, None]
+        fine = fine_table(grid.table.modes) @ tension.reshape(points, m * states)
+        fine = fine.reshape(FINE, m, states).swapaxes(0, 1).reshape(m * FINE, states)
+        share = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, FINE)))
     else:  # each point decides for itself: no polynomial passes through them
-        fine, x = tension.swapaxes(0, 1), np.log(grid.radius).swapaxes(0, 1)
-    fine, x = fine.reshape(-1, fine.shape[2]), x.reshape(-1, x.shape[2])
+        fine = tension.swapaxes(0, 1).reshape(m * points, states)
+        share = 0.5 * (1.0 + grid.table.xi)
     folded = fine < 0.0
     if slack > 0.0 and whole and state.relaxed is not None:
         kind = np.repeat(state.relaxed[0], FINE, axis=0)
-        folded = np.where(np.abs(fine) <= slack * np.abs(fine).max(axis=0), kind, folded)
+        bound = slack * np.maximum(fine.max(axis=0), -fine.min(axis=0))
+        folded = np.where(kind, fine < bound, fine < -bound)
     flips = folded[1:] != folded[:-1]
     changes = flips.sum(axis=0)
-    where = np.full((MOST_ZONES - 1, fine.shape[1]), np.nan)
-    rank = np.cumsum(flips, axis=0) - 1
-    rows, columns = np.nonzero(flips & (rank < MOST_ZONES - 1))
+    where = np.full((MOST_ZONES - 1, states), np.nan)
+    columns, rows = np.nonzero(flips.T)
+    rank = np.arange(len(columns)) - (np.cumsum(changes) - changes)[columns]
+    few = rank < MOST_ZONES - 1
+    columns, rows, rank = columns[few], rows[few], rank[few]
     low, high = fine[rows, columns], fine[rows + 1, columns]
-    share = np.clip(low / (low - high), 0.05, 0.95)
-    share = np.where(np.isfinite(share), share, 0.5)
-    where[rank[rows, columns], columns] = x[rows, columns] + share * (x[rows + 1, columns] - x[rows, columns])
+    part = np.clip(low / (low - high), 0.05, 0.95)
+    part = np.where(np.isfinite(part), part, 0.5)
+    element, place = np.divmod(np.stack((rows, rows + 1)), len(share))
+    left, right = grid.breaks[element, columns], grid.breaks[element + 1, columns]
+    x = left + share[place] * (right - left)
+    where[rank, columns] = x[0] + part * (x[1] - x[0])
     return Zones(changes, folded[0], where)
 
 
-def remap(problem: Problem, start: Start, breaks: Array, modes: int, wrinkled: NDArray[np.bool_]) -> Start:
-    """A state carried to other elements, of which those ``wrinkled`` (M,) are relaxed."""
-    old, state = start.grid, start.state
-    at = ritz.evaluate(problem, old, state)
+def remap(old: Grid, state: State, natural: Array, breaks: Array, modes: int, wrinkled: NDArray[np.bool_]) -> Start:
+    """A ``state`` of ``old`` carried to other elements, of which those ``wrinkled`` (M,) are relaxed.
+
+    ``natural`` is ``ln(l2)`` at the points of ``old`` to begin with where there are folds.
+    """
     grid = Grid.lay(modes, breaks)
-    t, m, states = grid.table, grid.elements, breaks.shape[1]
-    x = np.log(grid.radius).reshape(-1, states)
-    cuts = breaks[1:-1]
-    points = np.concatenate((x, cuts))
-    element = (points[None] > old.breaks[1:-1, None]).sum(axis=0)
-    columns = np.arange(states)
-    left, right = old.breaks[element, columns], old.breaks[element + 1, columns]
-    xi = np.clip(2.0 * (points - left) / (right - left) - 1.0, -1.0, 1.0)
-    weights = ritz.barycentric(old.table.xi, xi.ravel()).reshape(*xi.shape, -1)
+    t, states = grid.table, breaks.shape[1]
+    x = 0.5 * (t.xi[:, None, None] + 1.0) * (breaks[1:] - breaks[:-1]) + breaks[:-1]
 
-    def carried(values: Array) -> Array:
-        """From (Q, M, S) to the new points and cuts."""
-        result: Array = np.einsum("psq,psq->ps", weights, values[:, element, columns].transpose(1, 2, 0))
-        return result
+    def carry(x: Array) -> Callable[[Array], Array]:
+        """Takes point values (Q, M, S) of the old elements, as polynomials, to ``x`` (..., S)."""
+        inner = old.breaks[1:-1].reshape(-1, *(1,) * (x.ndim - 1), states)
+        element, columns = (x > inner).sum(axis=0), np.arange(states)
+        left, right = old.breaks[element, columns], old.breaks[element + 1, columns]
+        xi = np.clip(2.0 * (x - left) / (right - left) - 1.0, -1.0, 1.0)
 
-    e, slope = carried(at.e), carried(at.q - at.e)
-    inner = len(x)
-    e_xi = slope[:inner].reshape(t.points, m, states) / grid.dxi
-    bubbles = np.einsum("qk,qms->mks", t.values[t.points :, :modes] * t.weight[:, None], e_xi)
-    c = np.concatenate((bubbles.reshape(-1, states), e[inner:]))
-    w = np.maximum(carried(state.w)[:inner], state.w.min(axis=(0, 1))).reshape(t.points, m, states)
-    hoop = carried(at.log[1])[:inner].reshape(t.points, m, states)
-    relaxed = np.broadcast_to(wrinkled[:, None], w.shape)
-    return Start(grid, State(c, w, hoop, relaxed))
+        def at(values: Array) -> Array:
+            c = (old.table.to_legendre @ values.reshape(len(values), -1)).reshape(values.shape)
+            return np.asarray(np.polynomial.legendre.legval(xi, c[:, element, columns], tensor=False))
+
+        return at
+
+    to_points, to_cuts = carry(x), carry(breaks[1:-1])
+    e, q = old.strain(state.c)
+    bubbles = np.tensordot(t.to_modes, to_points(q - e) / grid.dxi, 1).swapaxes(0, 1)
+    c = np.concatenate((bubbles.reshape(-1, states), to_cuts(e)))
+    w = np.maximum(to_points(state.w), state.w.min(axis=(0, 1)))
+    return Start(grid, State(c, w, to_points(natural), np.broadcast_to(wrinkled[:, None], w.shape)))
 
 
-def settle(problem: Problem, grid: Grid, state: State, goal: float, limit: int = 30) -> Iterate:
-    """Newton on the state together with the cuts."""
-    t, m = grid.table, grid.elements
+def settle(problem: Problem, grid: Grid, state: State, goal: float, limit: int = 15) -> Iterate:
+    """Newton on the state together with the cuts, every wrinkled element a cone."""
     assert state.relaxed is not None
-    kinds = state.relaxed[0, :, 0]
-    states = state.w.shape[2]
+    kinds = state.relaxed[0, :, 0].tolist()
+    folded = tuple(k for k, kind in enumerate(kinds) if kind)
+    taut = tuple(k for k, kind in enumerate(kinds) if not kind)
+    modes, m = grid.table.modes, grid.elements
+    own = np.concatenate([np.arange(k * modes, (k + 1) * modes) for k in taut] + [np.arange(m * modes, grid.unknowns)])
+    film = State(state.c[own.astype(np.intp)], state.w[:, list(taut)])
+    cones = Cones.of(problem, grid, state, folded)
+    return _settle(problem, grid, film, taut, cones, goal, limit)
+
+
+def _settle(
+    problem: Problem, grid: Grid, film: State, taut: tuple[int, ...], cones: Cones, goal: float, limit: int
+) -> Iterate:
+    states = film.w.shape[2]
     steps = np.zeros(states, dtype=np.intp)
-    n = 0
     while True:
-        n += 1
-        at = ritz.evaluate(problem, grid, state)
-        step = ritz.newton(problem, grid, state, at)
-        new, change = ladder.advance(state, step, at, grid)
-        assert at.law.relief is not None
         steps += 1
-        de, dq = grid.strain(step.dc)
+        panels = grid.part(taut)
+        at = ritz.evaluate(problem, panels, film)
+        system = ritz.reduce(panels, film.w, at)
+        springs = Springs.of(problem, grid, panels, cones, film.c)
+        springs.join(system)
+        step = ritz.solve(problem, panels, system)
+        new, change = ladder.advance(film, step, at, panels)
+        cones, bent = springs.advance(step.dc, step.lam)
         # A cut that moves carries the strains with it: they must have settled as well as the slopes.
-        size = (np.abs(at.q) + state.w**2).max(axis=(0, 1))
-        change = np.maximum(change, np.abs(dq).max(axis=(0, 1)) / size)
-        if m > 1:
-            tension = at.law.t2 + at.law.h12 * (at.along * dq + at.down * step.dw) + at.law.h22 * at.around * de
-            breaks = grid.breaks.copy()
-            length = grid.breaks[1:] - grid.breaks[:-1]
-            for cut in range(1, m):
-                if kinds[cut - 1] == kinds[cut]:
-                    continue
-                taut, end, side = (cut, 0, 1.0) if kinds[cut - 1] else (cut - 1, 1, -1.0)
-                value = t.ends[end] @ tension[:, taut]
-                slope = (t.end_slopes[end] @ tension[:, taut]) * grid.dxi[taut] * side
-                # Towards the taut zone where it is not taut, away from it where it pulls at the cut.
-                shift = -value / slope * side
-                shift = np.where(slope > 0.0, shift, -0.2 * np.sign(value) * side * length[taut])
-                shift = np.clip(np.nan_to_num(shift), -0.5 * length[cut - 1], 0.5 * length[cut])
-                breaks[cut] += shift
-                change = np.maximum(change, CUT_WEIGHT * np.abs(shift) / np.minimum(length[cut - 1], length[cut]))
-            breaks[1:-1] = np.clip(breaks[1:-1], breaks[:-2], breaks[2:])
-            # Where it has settled the state belongs to the cuts as they were.
-            grid = Grid.lay(t.modes, np.where(change <= goal, grid.breaks, breaks))
-        state = new
+        de, dq = panels.strain(step.dc)
+        size = (np.abs(at.q) + film.w**2).max(axis=(0, 1), initial=1e-300)
+        change = np.maximum(np.maximum(change, bent), np.abs(dq).max(axis=(0, 1), initial=0.0) / size)
+        tension = at.law.t2 + at.law.h12 * (at.along * dq + at.down * step.dw) + at.law.h22 * at.around * de
+        breaks, shift = _moved(grid, panels, taut, cones.which, tension)
+        change = np.maximum(change, CUT_WEIGHT * shift)
+        # Where it has settled the state belongs to the cuts as they were.
+        grid = Grid.lay(grid.table.modes, np.where(change <= goal, grid.breaks, breaks))
+        film = new
         done = change <= goal
-        stable = step.stable & at.law.relief.regular.all(axis=(0, 1))
-        if done.all() or n >= limit:
+        stable = step.stable & springs.regular
+        rest = np.flatnonzero(~done)
+        if len(rest) == 0 or int(steps[0]) >= limit or len(rest) <= 0.5 * states:
             break
-        if n >= 5 and states > 1 and done.mean() > 0.5:
-            rest = np.flatnonzero(~done)
-            more = settle(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n)
-            state.put(rest, more.state)
-            lam = step.lam
-            lam[rest], change[rest], stable[rest] = more.lam, more.change, more.stable
-            steps[rest] += more.steps
-            ends = ladder.tail(problem, grid, state, step)
-            ends[rest] = more.tail
-            breaks = grid.breaks.copy()
-            breaks[:, rest] = more.grid.breaks
-            grid = Grid.lay(t.modes, breaks)
-            done = change <= goal
-            return Iterate(grid, state, lam, change, ends, stable, done & stable & (lam > 0.0), steps)
-    ends = ladder.tail(problem, grid, state, step)
-    return Iterate(grid, state, step.lam, change, ends, stable, done & stable & (step.lam > 0.0), steps)
+    ends = ladder.tail(problem, panels, film, step)
+    state = whole(grid, film, taut, cones)
+    result = Iterate(grid, state, step.lam, change, ends, stable, done & stable & (step.lam > 0.0), steps)
+    if len(rest) > 0 and int(steps[0]) < limit:
+        some = (problem.take(rest), grid.take(rest), film.take(rest), taut, cones.take(rest))
+        result.put(rest, _settle(*some, goal, limit - int(steps[0])))
+    return result
+
+
+def _moved(
+    grid: Grid, panels: Grid, taut: tuple[int, ...], folded: tuple[int, ...], tension: Array
+) -> tuple[Array, Array]:
+    """Breaks moved to where the hoop ``tension`` of the panels vanishes, and the largest shift over an element."""
+    t, breaks = grid.table, grid.breaks.copy()
+    length = breaks[1:] - breaks[:-1]
+    largest = np.zeros(breaks.shape[1])
+    for panel, element in enumerate(taut):
+        for end, side in ((0, 1.0), (1, -1.0)):
+            beside = element - int(side)
+            if beside not in folded:
+                continue
+            value = t.ends[end] @ tension[:, panel]
+            slope = (t.end_slopes[end] @ tension[:, panel]) * panels.dxi[panel] * side
+            # Towards the taut zone where it is not taut, away from it where it pulls at the cut.
+            shift = -value / slope * side
+            shift = np.where(slope > 0.0, shift, -0.2 * np.sign(value) * side * length[element])
+            cut = max(element, beside)
+            shift = np.clip(np.nan_to_num(shift), -0.5 * length[cut - 1], 0.5 * length[cut])
+            breaks[cut] += shift
+            largest = np.maximum(largest, np.abs(shift) / np.minimum(length[element], length[beside]))
+    breaks[1:-1] = np.clip(breaks[1:-1], breaks[:-2], breaks[2:])
+    return breaks, largest
 
 
 def _cut(film: Problem, edges: Array, first: bool) -> tuple[Array, NDArray[np.bool_]]:
@@ -245,28 +254,26 @@ def admissible(grid: Grid, state: State) -> NDArray[np.bool_]:
 
 
 def solve(
-    problem: Problem,
-    tolerance: float,
-    *,
-    sensitivities: bool,
-    begin: tuple[Grid, State] | None = None,
+    problem: Problem, tolerance: float, *, sensitivities: bool, begin: Start | None = None
 ) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
     """Solve states of which some part is wrinkled. Returns what `ladder.climb` does.
 
-    ``begin`` is a state with every point taut or wrinkled by itself; found by `search` when not given.
+    ``begin`` is a state of the plain equations, or one with every point taut or wrinkled by itself; found by `search`
+    when not given.
     """
     index = np.arange(len(problem.span))
     steps = np.zeros(len(index), dtype=np.intp)
+    answers: list[Answer] = []
+    lost = [index[:0]]
     if begin is None:
         grid = Grid.lay(START_MODES, problem.cut())
         found = search(problem, grid, guess(problem, grid))
         steps += found.steps
-        start, good = Start(grid, found.state), found.ok
-    else:
-        start, good = Start(*begin), np.ones(len(index), dtype=np.bool_)
-    answers: list[Answer] = []
-    lost = [index[~good]]
-    pending = [(index[good], Start(start.grid.take(good), start.state.take(good)))]
+        begin = Start(grid, found.state)
+        lost.append(index[~found.ok])
+        index = index[found.ok]
+        begin = begin.take(found.ok)
+    pending = [(index, begin)]
     for _ in range(ROUNDS):
         queue, pending = pending, []
         for some, begun in queue:
@@ -298,7 +305,8 @@ def _round(
         if len(some) == 0:
             continue
         part, grid, chosen = here.take(some), start.grid.take(some), state.take(some)
-        zone = zones(grid, chosen, ritz.evaluate(part, grid, chosen))
+        at = ritz.evaluate(part, grid, chosen)
+        zone = zones(grid, chosen, at)
         pattern = 2 * zone.changes + zone.first
         for number in np.unique(pattern).tolist():
             changes, first = number // 2, bool(number % 2)
@@ -309,7 +317,7 @@ def _round(
             film = part.take(of)
             breaks, wrinkled = _cut(film, zone.where[:changes, of], first)
             modes = max(3, ladder.first_modes(float((breaks[1:] - breaks[:-1]).max()), tolerance))
-            begun = remap(film, Start(grid.take(of), chosen.take(of)), breaks, modes, wrinkled)
+            begun = remap(grid.take(of), chosen.take(of), at.log[1][..., of], breaks, modes, wrinkled)
             done, missed, spent = ladder.climb(film, tolerance, begun, sensitivities=sensitivities, settle=settle)
             where = index[some[of]]
             lost.append(where[missed])
@@ -324,4 +332,4 @@ def _round(
                 answer.steps = steps[answer.index]
                 answers.append(answer.take(same))
                 if not same.all():
-                    again.append((answer.index[~same], Start(answer.grid.take(~same), answer.state.take(~same))))
+                    again.append((answer.index[~same], Start(answer.grid, answer.state).take(~same)))

@@ -43,8 +43,8 @@ def _at(problem: Problem, index: NDArray[np.intp], progress: Array) -> Problem:
 def lowest(problem: Problem, grid: Grid, state: State) -> Array:
     """Smallest eigenvalue of the reduced Hessian; minus infinity where the slopes themselves are unstable."""
     at = ritz.evaluate(problem, grid, state)
-    system = ritz.reduce(problem, grid, state.w, at)
-    matrix = np.moveaxis(system.matrix, -1, 0)
+    system = ritz.reduce(grid, state.w, at)
+    matrix = np.moveaxis(system.condensed(), -1, 0)
     good = np.isfinite(matrix).all(axis=(1, 2)) & system.positive
     out = np.full(len(good), -np.inf)
     out[good] = np.linalg.eigvalsh(matrix[good])[:, 0]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from model import ritz, tension_field
-from model.ladder import Start
 from model.law import Evaluations, Film
 from model.materials import EPSILON_0, NAMED, Material
 from model.membrane import Status, solve, solve_many
@@ -88,13 +87,14 @@ def test_cut_at_the_kink_keeps_spectral_convergence() -> None:
 
     grid = Grid.lay(12, problem.cut())
     begun = tension_field.search(problem, grid, tension_field.guess(problem, grid))
-    zone = tension_field.zones(grid, begun.state, ritz.evaluate(problem, grid, begun.state))
+    at = ritz.evaluate(problem, grid, begun.state)
+    zone = tension_field.zones(grid, begun.state, at)
     changes = int(zone.changes[0])
     breaks = np.concatenate((problem.cut()[:1], zone.where[:changes], problem.cut()[1:]))
     kinds = (np.arange(changes + 1) % 2 == 0) == bool(zone.first[0])
 
     def cut(modes: int) -> float:
-        start = tension_field.remap(problem, Start(grid, begun.state), breaks, modes, kinds)
+        start = tension_field.remap(grid, begun.state, at.log[1], breaks, modes, kinds)
         found = tension_field.settle(problem, start.grid, start.state, 1e-10)
         return abs(float(unit * found.lam[0]) / truth - 1.0)
 
