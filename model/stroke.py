@@ -27,6 +27,7 @@ SAMPLES = 65  # displacements at which the rest is looked for
 CHUNK = 8  # displacements of the path solved together
 STEP = 0.01  # their distance at first, in ring radii ...
 GROWTH = 1.5  # ... and how it grows from one chunk to the next
+CORRECTIONS = 5  # of a voltage that is nearly right
 ORDER = 16  # of the quadrature of the work
 INSIDE = 1e-5  # error of a peak field inside the film, which a parabola between points finds
 
@@ -197,6 +198,30 @@ def balancing(
     return replace(found, voltage=np.where(none, np.nan, voltage), known=~none), overcome
 
 
+def corrected(actuators: Sequence[Actuator], h: Array, voltage: Array, tolerance: float = 1e-8) -> Balance:
+    """Like `balancing`, from voltages that are nearly right; ``h`` and ``voltage`` hold one state an actuator."""
+    films, kind = films_of(actuators, h), kind_of(actuators)
+    push, bias_by_h = forces([one.bias for one in actuators], h)
+    voltage = np.array(voltage)
+    for n in range(CORRECTIONS):
+        there = weigh(h, voltage, solve_films(films, h, voltage, kind, tolerance), push, bias_by_h)
+        near = there.known & (np.abs(there.excess) <= tolerance * np.abs(push))
+        if near.all() or n == CORRECTIONS - 1:
+            break
+        with np.errstate(all="ignore"):
+            # V^2 is the nearly linear unknown: d(V^2) = 2 V dV.
+            square = voltage**2 - 2.0 * voltage * there.excess / there.by_voltage
+        voltage = np.where(near | ~(square > 0.0), voltage, np.sqrt(np.maximum(square, 0.0)))
+    if not near.all():
+        some = np.flatnonzero(~near)
+        voltage[some] = balancing([actuators[int(i)] for i in some], h[some], tolerance)[0].voltage
+        volts = np.nan_to_num(voltage)
+        there = weigh(h, volts, solve_films(films, h, volts, kind, tolerance), push, bias_by_h)
+        known = there.known & np.isfinite(voltage)
+        there = replace(there, voltage=np.where(known, voltage, np.nan), known=known)
+    return there
+
+
 @dataclass
 class _Way:
     """One actuator's way: the last state reached, the fold it is jumping from, and the bracket of its end."""
@@ -207,7 +232,8 @@ class _Way:
     stiffness: float
     reached: float  # displacement looked at last
     fold: bool = False
-    end: tuple[float, float, float, float] | None = None  # displacements and excesses on both sides of the end
+    end: _Point | None = None  # beyond the end
+    steepness: float = math.inf  # how fast the criterion's value rises with displacement at the end (1/m)
     limit: Limit | None = None
     snaps: int = 0
 
@@ -294,7 +320,7 @@ class _Point:
     def arrive(self, way: _Way) -> None:
         """Make this the state reached, or the far side of the end."""
         if self.excess >= 0.0:
-            way.end = way.h, self.h, way.excess, self.excess
+            way.end = self
         else:
             way.h, way.voltage, way.excess, way.stiffness = self.h, self.voltage, self.excess, self.stiffness
 
@@ -306,7 +332,7 @@ def _advance(way: _Way, point: _Point, actuator: Actuator, criteria: Criteria, t
         if way.fold:
             way.limit = Limit.SNAP
         else:
-            way.end = way.h, point.h, way.excess, math.nan
+            way.end = replace(point, voltage=math.nan, excess=math.nan)
         return
     if way.fold:
         if point.beyond(way):
@@ -371,21 +397,30 @@ def _close_in(actuators: list[Actuator], ways: list[_Way], criteria: Criteria, t
     some = [i for i, way in enumerate(ways) if way.end is not None]
     if not some:
         return
-    ends = np.array([ways[i].end for i in some])
-    shear = _shear([actuators[i] for i in some])
+    begin = [ways[i] for i in some]
+    ends = [way.end for way in begin if way.end is not None]
+    low, low_square, at_low = np.array([(way.h, way.voltage**2, way.excess) for way in begin]).T
+    high, high_square, at_high = np.array([(end.h, end.voltage**2, end.excess) for end in ends]).T
+    rise = (high_square - low_square) / (high - low)  # V^2 is nearly linear in h
+    parts = [actuators[i] for i in some]
+    shear = _shear(parts)
+
+    def state(x: Array, which: NDArray[np.intp]) -> Balance:
+        part = [parts[i] for i in which]
+        if not np.isfinite(rise[which]).all():
+            return balancing(part, x, tolerance)[0]
+        return corrected(part, x, np.sqrt(low_square[which] + rise[which] * (x - low[which])), tolerance)
 
     def value(x: Array, which: NDArray[np.intp]) -> Array:
-        part = [actuators[some[i]] for i in which]
-        there, _ = balancing(part, x, tolerance)
+        there = state(x, which)
         return np.where(there.known, criteria.excess(there.film, there.voltage, shear[which])[0], np.nan)
 
-    close = 0.1 * tolerance * np.array([actuators[i].film.ring_radius for i in some])
-    low, high, at_low, at_high = ends.T
+    close = 0.1 * tolerance * np.array([one.film.ring_radius for one in parts])
     h = enclosed(value, low, high, at_low, at_high, close)
-    there, _ = balancing([actuators[i] for i in some], h, tolerance)
+    there = state(h, np.arange(len(some)))
     excess, which = criteria.excess(there.film, there.voltage, shear)
-    for k, i in enumerate(some):
-        way = ways[i]
+    for k, way in enumerate(begin):
+        way.steepness = (at_high[k] - at_low[k]) / (high[k] - low[k]) if math.isfinite(at_high[k]) else math.inf
         way.h, way.voltage, way.excess = float(h[k]), float(there.voltage[k]), float(excess[k])
         way.limit = Limit(int(which[k])) if math.isfinite(at_high[k]) else Limit.FILM
 
@@ -433,7 +468,7 @@ def _gather(
         off = criteria.excess(sharp.film, voltage, shear)[0] - criteria.excess(end.film, voltage, shear)[0]
         inside = end.film.peak_field_radius > 1.0001 * np.array([one.film.disk_radius for one in chosen])
         off = 2.0 * np.abs(np.nan_to_num(off)) + np.where(inside & (limit[good] == Limit.BREAKDOWN), INSIDE, 0.0)
-        steep = np.array([_steepness(one) for one in ways])
+        steep = np.array([one.steepness for one in ways])
         with np.errstate(all="ignore"):
             real["error_estimate"][good] = (
                 begin.film.error_estimate * begin.pull / np.abs(begin.stiffness)
@@ -443,14 +478,6 @@ def _gather(
         work = _work(chosen, rest[good], reached, voltage, tolerance, folds_at_work)
         real["work"][good], real["work_error"][good], real["blocked_force"][good], way[good] = work
     return Strokes(rest=rest, limit=limit, status=status, way=way, snaps=snaps, **real)
-
-
-def _steepness(way: _Way) -> float:
-    """How fast the criterion's value rises with displacement at the end (1/m)."""
-    if way.end is None or not math.isfinite(way.end[3]):
-        return math.inf
-    low, high, at_low, at_high = way.end
-    return (at_high - at_low) / (high - low)
 
 
 def _work(
