@@ -32,6 +32,7 @@ from rig.watch import Watch, allowed_silence
 
 if TYPE_CHECKING:
     from calibration.certificate import Certificate
+    from rig.log.process import LogProcess
     from rig.log.writer import LogWriter
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
@@ -91,7 +92,7 @@ class Engine:
         Opened, not yet attached.
     actions : sequence of Action
         From `rig.plan.plan`, already checked.
-    log : LogWriter
+    log : LogWriter or LogProcess
         Open; the engine writes rows, the caller attaches scene and protocol and finishes it.
     gains : Gains
         From the sensors' certificates.
@@ -112,7 +113,7 @@ class Engine:
         self,
         bench: Bench,
         actions: Sequence[Action],
-        log: LogWriter,
+        log: LogWriter | LogProcess,
         gains: Gains,
         control: Control,
         progress: Callable[[float, float, str], None],

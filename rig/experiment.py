@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 from collections.abc import Callable
@@ -17,6 +18,8 @@ from rig.clock import Clock, calendar_now
 from rig.control import Control, Keyboard, Source
 from rig.engine import Engine, Outcome
 from rig.errors import ConfigError, FaultError
+from rig.log import space
+from rig.log.process import LogProcess
 from rig.log.writer import LogWriter
 from rig.plan import Action, Prediction, check_plan, plan
 from rig.protocol import Protocol, load_protocol
@@ -104,6 +107,7 @@ def run(
         What ended the run early; the rig has been made safe and the log finished by then, and the error carries the
         outcome as a note.
     """
+    space.check(out, experiment.duration, experiment.scene.rates)
     in_memory = not experiment.scene.on_real_ports
     if consent is None:
         consent = Consent(IN_MEMORY, IN_MEMORY) if in_memory else Consent()
@@ -112,7 +116,7 @@ def run(
     try:
         problems = _check_dates(experiment.certificates, bench.clock)
         with (
-            LogWriter(out) as log,
+            _log(out, experiment.scene) as log,
             closing(Control([] if in_memory else _sources(out), consent.answers, say)) as control,
             stop_on_signals(control, control.ask_pause),
         ):
@@ -184,7 +188,14 @@ def gains_of(certificates: dict[str, Certificate]) -> Gains:
     return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit)
 
 
-def _attach(log: LogWriter, experiment: Experiment, problems: list[str]) -> None:
+def _log(out: Path, scene: Scene) -> LogWriter | LogProcess:
+    """On real ports a process of its own writes the log; in memory, the same run gives the same bytes."""
+    if scene.on_real_ports and os.name == "posix":
+        return LogProcess(out)
+    return LogWriter(out)
+
+
+def _attach(log: LogWriter | LogProcess, experiment: Experiment, problems: list[str]) -> None:
     """What a reader needs to understand the run; first in the file, so that it survives whatever comes."""
     log.attach("scene.toml", "application/toml", experiment.scene_text.encode())
     log.attach("protocol.toml", "application/toml", experiment.protocol_text.encode())

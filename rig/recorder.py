@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Literal
 
 from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample, StageSample
 from rig.clock import Clock
+from rig.log import space
 from rig.log.errors import LogError
 
 if TYPE_CHECKING:
+    from rig.log.process import LogProcess
     from rig.log.writer import LogWriter
 
 Severity = Literal["info", "warning", "error"]
@@ -37,7 +39,7 @@ class Recorder:
     ``force`` and ``displacement`` are NaN until their references are known.
     """
 
-    def __init__(self, log: LogWriter, clock: Clock, gains: Gains, *, has_laser: bool) -> None:
+    def __init__(self, log: LogWriter | LogProcess, clock: Clock, gains: Gains, *, has_laser: bool) -> None:
         self._log = log
         self._clock = clock
         self._gains = gains
@@ -50,6 +52,7 @@ class Recorder:
         self.contact = math.nan
         self.has_laser = has_laser
         self.log_failed = False
+        self._told_of_space = False
         self.best_effort = False  # on the way to the safe state a log that fails is no reason to stop
 
     @property
@@ -167,7 +170,7 @@ class Recorder:
         self._write("/target", self._clock.now(), displacement_m=displacement, voltage_V=voltage, speed_m_per_s=speed)
 
     def tick(self, now: float) -> None:
-        """Let the log send what is due to its file."""
+        """Let the log send what is due to its file, and look at the room it has left on its disk."""
         if self.log_failed:
             return
         try:
@@ -176,6 +179,16 @@ class Recorder:
             self.log_failed = True
             if not self.best_effort:
                 raise
+            return
+        free = self._log.free
+        if free is None or free >= space.WARN_FREE:
+            return
+        left = f"its disk has {free / 1e6:.0f} MB left"
+        if not self._told_of_space:
+            self._told_of_space = True
+            self.event("warning", "log", f"{left}; the run ends when it is less than {space.LEAST_FREE / 1e6:.0f} MB")
+        if free < space.LEAST_FREE and not self.best_effort:  # the log itself is sound and can be finished
+            raise LogError(self._log.path, left, "The run ended before the disk was full. Free some space.")
 
     def _write(self, topic: str, t: float, **fields: object) -> None:
         """The first error of the log ends the run; after it the way to the safe state goes on unrecorded."""

@@ -312,6 +312,14 @@ class Scene(Table):
         return {role: table for role, table in tables.items() if table is not None}
 
     @property
+    def rates(self) -> dict[str, float]:
+        """How often each instrument is to give a sample (Hz), by role."""
+        return {
+            role: table.rate_Hz if isinstance(table, GSV8Table | CiA404Table) else table.poll_rate_Hz
+            for role, table in self.instruments.items()
+        }
+
+    @property
     def on_real_ports(self) -> bool:
         """True when the instruments are reached through ports, False for the simulated bench in memory."""
         return is_connected(self.stage)

@@ -18,7 +18,7 @@ MESSAGE, ATTACHMENT, METADATA, FINISH = range(1, 5)
 READY, ALIVE, DONE, FAILED = range(5, 9)
 
 MESSAGE_HEAD = struct.Struct("<BQQ")  # index of the topic in rig.log.schema.CHANNELS, log time, publish time
-FREE = struct.Struct("<Q")  # in ALIVE: bytes free on the disk
+FREE = struct.Struct("<q")  # in ALIVE: bytes free on the disk; -1: not known
 
 
 def pack(kind: int, body: bytes) -> bytes:

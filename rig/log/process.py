@@ -41,6 +41,8 @@ class LogProcess(RemoteLog):
         Where the log is until it is finished.
     kept : Path or None
         Where the log stayed when the block ended without `finish`.
+    free : int or None
+        Bytes free on its disk, as the writer last said.
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,7 +73,7 @@ class LogProcess(RemoteLog):
         self.pid = self._process.pid
         try:
             self._wait_for(frames.READY, START_S)
-        except LogError:
+        except BaseException:
             self._close_ends()
             self._leave()
             raise

@@ -138,7 +138,8 @@ class RemoteLog:
                 for kind, body in self._unpack.feed(data):
                     self._heard.add(kind)
                     if kind == frames.ALIVE:
-                        self.free = frames.FREE.unpack(body)[0]
+                        (free,) = frames.FREE.unpack(body)
+                        self.free = free if free >= 0 else None
                     elif kind == frames.FAILED:
                         path, what, advice = json.loads(body)
                         self._failure = LogError(Path(path), what, advice)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import select
-import shutil
 import signal
 import socket
 import sys
@@ -108,9 +107,8 @@ def _record(log: LogWriter, producers: Sequence[Producer]) -> bool:
         log.sync()
         if began >= next_alive:
             next_alive = began + ALIVE_S
-            free = frames.FREE.pack(shutil.disk_usage(log.part.parent).free)
             for producer in listening:
-                producer.say(frames.ALIVE, free)
+                producer.say(frames.ALIVE, frames.FREE.pack(-1 if log.free is None else log.free))
         clock.sleep_until(began + SHORTEST_TURN_S)  # many messages a turn cost less than a turn a message
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from rig.log import schema
+from rig.log import schema, space
 from rig.log.checks import Checks
 from rig.log.container import ContainerWriter
 from rig.log.errors import LogError
@@ -17,6 +18,7 @@ from rig.log.part_file import PartFile
 # A chunk is written when its first message is this old, so that a loop that ticks every 20 ms or faster
 # never has more than 100 ms of samples in memory.
 CHUNK_SECONDS = 0.08
+FREE_SECONDS = 1.0
 
 
 class LogWriter:
@@ -33,6 +35,15 @@ class LogWriter:
     path : Path
         The log to write.
 
+    Attributes
+    ----------
+    part : Path
+        Where the log is until it is finished.
+    kept : Path or None
+        Where it stayed when the block ended without `finish`.
+    free : int or None
+        Bytes free on its disk, looked up once a second; None before the first `tick`.
+
     Raises
     ------
     LogError
@@ -44,6 +55,8 @@ class LogWriter:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.kept: Path | None = None
+        self.free: int | None = None
+        self._next_look = -math.inf
         self._channels: dict[str, int] = {}
         self._checks = Checks(path)
         self._chunk_since: float | None = None
@@ -89,6 +102,10 @@ class LogWriter:
     def tick(self, now: float) -> None:
         """Send what is due to the file. To be called in every turn of the loop, with the clock's time in seconds."""
         self._file.check()
+        if now >= self._next_look:
+            self._next_look = now + FREE_SECONDS
+            with suppress(OSError):
+                self.free = space.free(self.part.parent)
         if self._container.chunk_is_empty:
             self._chunk_since = None
         elif self._chunk_since is None:

@@ -170,6 +170,7 @@ def test_a_stall_alone_is_not_off_rate() -> None:
 def test_the_first_block_ends_at_its_arrival() -> None:
     clock = SampleClock[str](10.0, {})
     assert clock.feed(5.0, []) == []
+    assert clock.other_rate() is None  # the clock need not begin at zero
     assert clock.feed(7.0, ["a", "b", "c"]) == [
         (pytest.approx(6.8), "a"),
         (pytest.approx(6.9), "b"),

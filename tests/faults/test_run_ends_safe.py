@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +13,7 @@ import pytest
 from drivers.link import DeviceError, DeviceLost
 from rig.control import Control
 from rig.errors import ConfigError, FaultError, LimitError, Stopped
+from rig.log import part_file, space
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
@@ -187,13 +191,45 @@ def test_a_log_that_fails_on_the_way_to_the_safe_state_stops_nothing(
     assert abs(story.final_output) < 60 and story.outcome.safe and story.outcome.standing
 
 
-def test_a_log_that_cannot_be_written_ends_the_run(tell: Tell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_ends_the_run_and_leaves_a_readable_log(tell: Tell, monkeypatch: pytest.MonkeyPatch) -> None:
     def fill_the_disk(bench: SimulatedBench, stop: Control) -> None:
-        def full(self: LogWriter, data: bytes) -> None:
-            raise LogError(self.path, "writing failed (No space left on device)")
+        def write(fd: int, data: memoryview) -> int:
+            if not stat.S_ISREG(os.fstat(fd).st_mode):
+                return real(fd, data)
+            if left:
+                return real(fd, data[: left.pop()])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        monkeypatch.setattr(LogWriter, "tick", full)
+        real, left = os.write, [100]  # a record is torn
+        monkeypatch.setattr(part_file.os, "write", write)
 
     story = tell(fill_the_disk)
-    assert isinstance(story.error, LogError)
+    assert isinstance(story.error, LogError) and "No space left" in story.outcome.reason
     assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S
+    kept = read_log(story.log.with_name("run.mcap.part"))
+    assert [gap.reason for gap in kept.gaps] == ["the file ends here without its end record"]
+    assert story.mischief_at - 0.1 < kept.columns("/force/sample")["t_s"][-1] <= story.mischief_at
+
+
+def test_a_disk_that_is_nearly_full_ends_the_run_with_a_finished_log(
+    tell: Tell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    story = tell(lambda bench, stop: monkeypatch.setattr(space, "free", lambda folder: space.WARN_FREE - 1))
+    assert story.outcome.status == "complete"
+    told = [m.fields for m in read_log(story.log).messages("/event") if m.fields["source"] == "log"]
+    assert [(fields["severity"], fields["message"][:29]) for fields in told] == [
+        ("warning", "its disk has 256 MB left; the")
+    ]
+    story.log.unlink()
+
+    story = tell(lambda bench, stop: monkeypatch.setattr(space, "free", lambda folder: space.LEAST_FREE - 1))
+    assert isinstance(story.error, LogError) and "32 MB left" in story.outcome.reason
+    assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S + 1.0
+    log = read_log(story.log)
+    assert log.whole and log.outcome is not None and log.outcome["safe"] == "yes"
+
+
+def test_a_log_takes_less_room_than_estimated(tell: Tell) -> None:
+    story = tell()
+    rates = {"stage": 50.0, "force": 100.0, "displacement": 50.0, "hv": 10.0}
+    assert 0.3 < story.log.stat().st_size / space.needed(story.end, rates) < 0.8
