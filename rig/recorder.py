@@ -174,13 +174,12 @@ class Recorder:
         if self.log_failed:
             return
         try:
-            self._log.tick(now)
+            free = self._log.tick(now)
         except LogError:
             self.log_failed = True
             if not self.best_effort:
                 raise
             return
-        free = self._log.free
         if free is None or free >= space.WARN_FREE:
             return
         left = f"its disk has {free / 1e6:.0f} MB left"

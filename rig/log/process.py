@@ -41,8 +41,6 @@ class LogProcess(RemoteLog):
         Where the log is until it is finished.
     kept : Path or None
         Where the log stayed when the block ended without `finish`.
-    free : int or None
-        Bytes free on its disk, as the writer last said.
     """
 
     def __init__(self, path: Path) -> None:

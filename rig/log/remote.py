@@ -60,7 +60,7 @@ class RemoteLog:
 
     def __init__(self, path: Path, end: socket.socket) -> None:
         self.path = path
-        self.free: int | None = None
+        self._free: int | None = None
         self._end = end
         self._end.setblocking(False)
         self._checks = Checks(path)
@@ -85,8 +85,11 @@ class RemoteLog:
         if len(self._waiting) > MOST_WAITING:
             raise self._fail("the process that writes the log does not keep up", "Use a faster disk.")
 
-    def tick(self, now: float) -> None:
-        """Send what waits and listen to the writer. To be called in every turn, with the clock's time in seconds."""
+    def tick(self, now: float) -> int | None:
+        """Send what waits and listen to the writer. To be called in every turn, with the clock's time in seconds.
+
+        Returns the bytes free on the log's disk, as the writer last said; None when they are not known.
+        """
         self._check()
         self._send()
         self._listen()
@@ -98,6 +101,7 @@ class RemoteLog:
                 f"the process that writes the log has not answered for {SILENCE_S:.0f} s",
                 "Its disk may hang or be very slow.",
             )
+        return self._free
 
     def close(self) -> None:
         """Send what waits, then close this end."""
@@ -139,7 +143,7 @@ class RemoteLog:
                     self._heard.add(kind)
                     if kind == frames.ALIVE:
                         (free,) = frames.FREE.unpack(body)
-                        self.free = free if free >= 0 else None
+                        self._free = free if free >= 0 else None
                     elif kind == frames.FAILED:
                         path, what, advice = json.loads(body)
                         self._failure = LogError(Path(path), what, advice)

@@ -103,12 +103,12 @@ def _record(log: LogWriter, producers: Sequence[Producer]) -> bool:
                     outcome, give_up = json.loads(body), clock.now() + OTHERS_S
                 else:
                     _take(log, kind, body)
-        log.tick(clock.now())
+        free = log.tick(clock.now())
         log.sync()
         if began >= next_alive:
             next_alive = began + ALIVE_S
             for producer in listening:
-                producer.say(frames.ALIVE, frames.FREE.pack(-1 if log.free is None else log.free))
+                producer.say(frames.ALIVE, frames.FREE.pack(-1 if free is None else free))
         clock.sleep_until(began + SHORTEST_TURN_S)  # many messages a turn cost less than a turn a message
 
 

@@ -41,8 +41,6 @@ class LogWriter:
         Where the log is until it is finished.
     kept : Path or None
         Where it stayed when the block ended without `finish`.
-    free : int or None
-        Bytes free on its disk, looked up once a second; None before the first `tick`.
 
     Raises
     ------
@@ -55,7 +53,7 @@ class LogWriter:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.kept: Path | None = None
-        self.free: int | None = None
+        self._free: int | None = None
         self._next_look = -math.inf
         self._channels: dict[str, int] = {}
         self._checks = Checks(path)
@@ -99,13 +97,16 @@ class LogWriter:
             self._channels[topic] = channel
         self._container.add_message(channel, data, log_ns, publish_ns)
 
-    def tick(self, now: float) -> None:
-        """Send what is due to the file. To be called in every turn of the loop, with the clock's time in seconds."""
+    def tick(self, now: float) -> int | None:
+        """Send what is due to the file. To be called in every turn of the loop, with the clock's time in seconds.
+
+        Returns the bytes free on the disk, looked up once a second; None when the system does not tell.
+        """
         self._file.check()
         if now >= self._next_look:
             self._next_look = now + FREE_SECONDS
             with suppress(OSError):
-                self.free = space.free(self.part.parent)
+                self._free = space.free(self.part.parent)
         if self._container.chunk_is_empty:
             self._chunk_since = None
         elif self._chunk_since is None:
@@ -113,6 +114,7 @@ class LogWriter:
         elif not now - self._chunk_since < CHUNK_SECONDS:
             self._container.end_chunk()
             self._chunk_since = None
+        return self._free
 
     def sync(self) -> None:
         """Have the disk confirm what was sent to the file; may take long, so not to be called by who drives a rig."""
