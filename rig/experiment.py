@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -95,11 +95,13 @@ def run(
     progress: Callable[[float, float, str], None],
     consent: Consent | None = None,
     say: Callable[[str], None] = lambda text: None,
+    origin: Mapping[str, Mapping[str, str]] | None = None,
 ) -> Outcome:
     """Carry the experiment out and leave a finished log at ``out``.
 
-    On the simulated bench in memory nobody is asked anything: every question is answered as expected, and the log says
-    so. Returns the outcome of a run that ended as planned.
+    ``origin`` is what the log says of the versions and the host that made it, by default the true ones. On the
+    simulated bench in memory nobody is asked anything: every question is answered as expected, and the log says so.
+    Returns the outcome of a run that ended as planned.
 
     Raises
     ------
@@ -120,7 +122,7 @@ def run(
             closing(Control([] if in_memory else _sources(out), consent.answers, say)) as control,
             stop_on_signals(control, control.ask_pause),
         ):
-            _attach(log, experiment, problems)
+            _attach(log, experiment, problems, _this_origin() if origin is None else origin)
             certificates = experiment.certificates
             engine = Engine(
                 bench,
@@ -195,7 +197,27 @@ def _log(out: Path, scene: Scene) -> LogWriter | LogProcess:
     return LogWriter(out)
 
 
-def _attach(log: LogWriter | LogProcess, experiment: Experiment, problems: list[str]) -> None:
+def _bench(scene: Scene) -> str:
+    if scene.bench is not None:
+        return f"replay of {Path(scene.bench.log).name}"
+    return ON_PORTS if scene.on_real_ports else IN_MEMORY
+
+
+def _this_origin() -> dict[str, dict[str, str]]:
+    return {
+        "versions": {name: metadata.version(name) for name in RECORDED_PACKAGES},
+        "host": {
+            "python": sys.version.split()[0],
+            "system": platform.system(),
+            "machine": platform.machine(),
+            "started": calendar_now().isoformat(timespec="seconds"),
+        },
+    }
+
+
+def _attach(
+    log: LogWriter | LogProcess, experiment: Experiment, problems: list[str], origin: Mapping[str, Mapping[str, str]]
+) -> None:
     """What a reader needs to understand the run; first in the file, so that it survives whatever comes."""
     log.attach("scene.toml", "application/toml", experiment.scene_text.encode())
     log.attach("protocol.toml", "application/toml", experiment.protocol_text.encode())
@@ -208,18 +230,10 @@ def _attach(log: LogWriter | LogProcess, experiment: Experiment, problems: list[
             "scene": experiment.scene.title,
             "protocol": experiment.protocol.title,
             "specimen": experiment.scene.specimen.name,
-            "bench": ON_PORTS if experiment.scene.on_real_ports else IN_MEMORY,
+            "bench": _bench(experiment.scene),
             "without_certificate": " ".join(role for role in uncalibrated if role != "stage"),
             "certificate_problems": "; ".join(problems),
         },
     )
-    log.metadata("versions", {name: metadata.version(name) for name in RECORDED_PACKAGES})
-    log.metadata(
-        "host",
-        {
-            "python": sys.version.split()[0],
-            "system": platform.system(),
-            "machine": platform.machine(),
-            "started": calendar_now().isoformat(timespec="seconds"),
-        },
-    )
+    for name, table in origin.items():
+        log.metadata(name, table)
