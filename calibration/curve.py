@@ -70,6 +70,8 @@ class Curve:
         compliance that is believed; 0 where a sensor on the disk measures ``h``. One rig: the same in all curves.
     eccentricity : float
         Standard uncertainty of the distance of the disk's centre from the ring's (m).
+    time : ndarray, shape (n,), optional
+        When each sample was taken, on the clock of its run (s). With it a viscous film can be told from other errors.
     flagged : ndarray of bool, shape (n,), optional
         Samples that an instrument itself called bad.
     """
@@ -94,6 +96,7 @@ class Curve:
     disk_radius_uncertainty: float = 0.0
     compliance_uncertainty: float = 0.0
     eccentricity: float = 0.0
+    time: Array | None = None
     flagged: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
@@ -107,6 +110,8 @@ class Curve:
         if not np.isin(self.direction, (-1, 0, 1)).all():
             raise CurveError(f"curve {self.label!r}: direction must be +1 (loading), -1 (unloading) or 0 (neither)")
         self._column("direction", np.int8, n)
+        if self.time is not None and not np.isfinite(self._column("time", np.float64, n)).all():
+            raise CurveError(f"curve {self.label!r}: time holds a value that is not finite")
         if self.flagged is None:
             object.__setattr__(self, "flagged", np.zeros(n, dtype=np.bool_))
         self._column("flagged", np.bool_, n)

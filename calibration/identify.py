@@ -23,10 +23,12 @@ from numpy.typing import NDArray
 from scipy.special import gammaincc
 
 from calibration.curve import Curve
+from calibration.held_out import held_out
 from calibration.identifiability import advice
+from calibration.misfit import SIGNIFICANT, suspects
 from calibration.problem import NODES, TOLERANCE, IdentificationError, Problem
 from calibration.profile import intervals, targets, widened
-from calibration.propagation import secant_modulus, state
+from calibration.propagation import determined, least_tangent, secant_modulus, state
 from calibration.reduction import Selection, interpolation_matrix, select
 from calibration.result import IDENTIFIED, CurveResult, Identification, verdict
 from calibration.search import minimise_many
@@ -39,10 +41,6 @@ __all__ = ["IdentificationError", "compare", "identify", "secant_modulus"]
 
 PASSES = 5
 WRONG_MODEL = 9.0  # lack of fit per degree of freedom from which on the model does not describe the data at all
-SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
-SHARE_BOUNDS = (1e-6, 100.0)
-EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
-PERMITTIVITY_BOUNDS = (0.5, 200.0)
 FINAL, MOST_STEPS = 1e-5, 60  # relative decrease of chi-square that ends the last fit, and its evaluations
 MOST_NODES = 36
 SEARCH_TOLERANCE = 1e-6  # of the membrane's force, relative, while the minima are sought
@@ -120,8 +118,7 @@ def identify(
             best = _representative(fits)
             material = search.film(best.x)
         problem = Problem(curves, selections, terms, material, nodes=nodes, wrinkling=wrinkling)
-        again = _minimise(problem, best.restarted(problem), held)
-        best = best if again is None else again
+        best = _polish(problem, best, held) or best
         material = problem.film(best.x)
         previous, selections = selections, select(curves, material, wrinkling)
         if nodes < MOST_NODES and _too_coarse(problem, best.x):
@@ -131,6 +128,7 @@ def identify(
             break
     else:
         notes.append("the set of samples at which the film is taut did not settle while fitting")
+    best = _confirm(problem, best, held)
     notes += _other_minima(fits)
     record = {
         "data": dict(provenance or {}),
@@ -157,14 +155,15 @@ def _same(before: Sequence[Selection], after: Sequence[Selection]) -> bool:
 
 
 def compare(curves: Sequence[Curve], *, terms: Sequence[int] = (1, 2, 3), **options: Any) -> list[Identification]:
-    """`identify` with each number of Ogden terms, to be compared by ``aicc`` and ``bic``; ``options`` as there.
+    """`identify` with each number of Ogden terms, compared by ``aicc``, ``bic`` and ``held_out``; ``options`` as there.
 
     Each starts from what fewer terms found, too: more terms never fit worse.
     """
     found: list[Identification] = []
     for count in terms:
         fewer = [one.material for one in found if one.terms < count]
-        found.append(identify(curves, terms=count, near=fewer[-1:], **options))
+        one = identify(curves, terms=count, near=fewer[-1:], **options)
+        found.append(replace(one, held_out=held_out(curves, one.material, options.get("wrinkling", "plain"))))
     return found
 
 
@@ -261,7 +260,7 @@ def _search(problem: Problem, materials: Sequence[Material], held: Mapping[str, 
     n = problem.terms
     varied = np.array([name not in held for name in problem.names])
     points = np.array([problem.vector(material) for material in materials])
-    low, high = (np.array(side) for side in zip(*(_bounds(problem, x) for x in points), strict=True))
+    low, high = (np.array(side) for side in zip(*(problem.bounds(x) for x in points), strict=True))
     points = np.where(varied, np.clip(points, low, high), points)
     if problem.electric and "eps_r" not in held:
         for _ in range(8):
@@ -301,20 +300,22 @@ def _fit(
     return _Fit(problem, x, cost, converged, varied, at_bound)
 
 
-def _minimise(problem: Problem, start: Array, held: Mapping[str, float]) -> _Fit | None:
-    """Least squares by lmfit from near the minimum; None where the model has no answer there."""
+def _polish(problem: Problem, near: _Fit, held: Mapping[str, float]) -> _Fit | None:
+    """The minimum of ``problem`` near that of another one; None where the model has no answer there."""
+    start = near.restarted(problem)
+    low, high = problem.bounds(start)
+    varied = np.array([name not in held for name in problem.names])
+    start = np.where(varied, np.clip(start, low, high), start)
+    (found,) = minimise_many(problem, start[None], (low[None], high[None]), varied, decrease=1e-4)
+    return None if found is None else _fit(problem, found.x, found.cost, found.converged, (low, high), varied, held)
+
+
+def _confirm(problem: Problem, near: _Fit, held: Mapping[str, float]) -> _Fit:
+    """The minimum by lmfit's least squares, from where ours ended."""
     import lmfit
 
-    lower, upper = _bounds(problem, start)
-    varied = np.array([name not in held for name in problem.names])
-    margin = np.where(np.isfinite(upper - lower), 1e-3 * (upper - lower), 0.0)
-    inside = np.clip(start, lower + np.minimum(margin, 1e-6), upper - np.minimum(margin, 1e-6))
-    start = np.where(varied, inside, start)
-    (near,) = minimise_many(problem, start[None], (lower[None], upper[None]), varied, decrease=1e-3)
-    if near is None:
-        return None
-    start = near.x
-
+    lower, upper = problem.bounds(near.x)
+    varied, start = near.varied, near.x
     parameters = lmfit.Parameters()
     for name, value, low, high, vary in zip(problem.names, start, lower, upper, varied, strict=True):
         parameters.add(name, value=float(value), min=low, max=high, vary=bool(vary))
@@ -338,24 +339,11 @@ def _minimise(problem: Problem, start: Array, held: Mapping[str, float]) -> _Fit
             method="least_squares", jac=jacobian, x_scale="jac", ftol=FINAL, xtol=1e-9, gtol=1e-9, max_nfev=MOST_STEPS
         )
     x = vector(out.params)
-    if not problem.answers(x):
-        return None
     final = problem.residual(x)
-    return _fit(problem, x, float(final @ final), bool(out.success), (lower, upper), varied, held)
-
-
-def _bounds(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Lower and upper bounds of a parameter vector; exponents keep the sign they have in ``x``."""
-    n = problem.terms
-    lower = np.full(x.size, -np.inf)
-    upper = np.full(x.size, np.inf)
-    lower[:n], upper[:n] = SHARE_BOUNDS
-    negative = x[n : 2 * n] < 0.0
-    lower[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[1], EXPONENT_BOUNDS[0])
-    upper[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[0], EXPONENT_BOUNDS[1])
-    if problem.electric:
-        lower[2 * n], upper[2 * n] = PERMITTIVITY_BOUNDS
-    return lower, upper
+    cost = float(final @ final)
+    if not cost < near.cost:  # it was there already
+        return replace(near, converged=near.converged or bool(out.success))
+    return _fit(problem, x, cost, bool(out.success), (lower, upper), varied, held)
 
 
 def _representative(fits: Sequence[_Fit]) -> _Fit:
@@ -399,11 +387,14 @@ def _assemble(
     probability = float(gammaincc(misfit_freedom / 2, fit.cost / 2))
     misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
     rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits]
-    stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals)
+    doubts = suspects(problem, x, determined(problem, fit.at_bound, held))
+    guilty = doubts[0] if doubts and doubts[0].significant else None
+    bias = None if guilty is None else guilty.amplitude * guilty.shape
+    stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals, suspect=bias)
     quantities = stated.quantities
     if profiles:
         aims = targets(problem, stated.stretch, held)
-        found = intervals(problem, x, _bounds(problem, x), fit.varied, quantities, aims, misfit)
+        found = intervals(problem, x, problem.bounds(x), fit.varied, quantities, aims, misfit)
         quantities.update({name: widened(quantities[name], ends, misfit) for name, ends in found.items()})
     curves = _curve_results(problem, x)
     used = sum(curve.used for curve in curves)
@@ -418,12 +409,14 @@ def _assemble(
         quantities=quantities,
         stretch=stated.stretch,
         stiffness_curve=stated.stiffness_curve,
+        least_tangent=least_tangent(problem.film(x), stated.stiffness_curve.meridional_stretch[-1], stated.stretch[1]),
         nuisance=stated.nuisance,
         chi_square=chi_square,
         freedom=used - free,
         lack_of_fit=fit.cost,
         lack_of_fit_freedom=misfit_freedom,
         lack_of_fit_probability=probability,
+        suspects=doubts,
         noise_ratio=math.sqrt(problem.noise_variance),
         samples_per_independent=problem.correlation_time,
         parameters=stated.parameters,
@@ -524,6 +517,8 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
     if lost:
         shares = ", ".join(f"{name} to {_share(quantity.relative)}" for name, quantity in lost.items())
         words.append(f"not determined by this data: {shares} (standard uncertainty over value)")
+    if not result.least_tangent > 0.0:
+        words.append("the film found is not stable at every stretch that was reached: use no model built on it")
     if result.lack_of_fit_probability < SIGNIFICANT:
         ratio = math.sqrt(result.lack_of_fit / result.lack_of_fit_freedom)
         words.append(
@@ -531,6 +526,12 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
             f"give, probability {result.lack_of_fit_probability:.1g}); the uncertainties contain an allowance for it, "
             "but a wrong model has errors that no uncertainty covers"
         )
+    for suspect in result.suspects[:1]:
+        if suspect.significant:
+            words.append(
+                f"the model does not explain the data: the residuals look like {suspect.words}; what that does to the "
+                "results is in their uncertainties"
+            )
     if problem.excess > 1.0:
         words.append(
             f"the samples scatter {result.noise_ratio:.2f} times as much as stated; "

@@ -29,6 +29,9 @@ Array = NDArray[np.float64]
 
 NODES = 8  # of every part of a curve, to begin with
 TOLERANCE = 1e-7  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
+SHARE_BOUNDS = (1e-6, 100.0)  # positive: so is every mu_n alpha_n, which makes the film stable at any stretch
+EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
+PERMITTIVITY_BOUNDS = (0.5, 200.0)
 INVALID_RESIDUAL = 1e8  # where the membrane has no state; larger than any real residual
 
 
@@ -56,6 +59,7 @@ class Evaluation:
     residual: Array
     jacobian: Array
     answered: NDArray[np.bool_]
+    states: States
 
     @property
     def cost(self) -> Array:
@@ -128,7 +132,8 @@ class Problem:
         self.excess = ratio if significant and not trust_noise else 1.0
         self.correlation_time = 1.0 if trust_noise else correlation_time(self.blocks)
         self.inflation = self.excess * self.correlation_time
-        self._roots = [block.root / math.sqrt(self.inflation) for block in self.blocks]
+        self.roots = [block.root / math.sqrt(self.inflation) for block in self.blocks]
+        self.ways = [block.way for block in self.blocks]
         self._target = np.concatenate([block.target for block in self.blocks]) / math.sqrt(self.inflation)
         self._last: tuple[bytes, Evaluation] | None = None
 
@@ -164,6 +169,18 @@ class Problem:
         eps = [material.eps_r] if self.electric else []
         return np.concatenate((mu * alpha / (2.0 * self.scale), alpha, eps, np.zeros(len(self.nuisances))))
 
+    def bounds(self, x: Array) -> tuple[Array, Array]:
+        """Lower and upper bounds of a parameter vector; exponents keep the sign they have in ``x``."""
+        n = self.terms
+        lower, upper = np.full(x.size, -np.inf), np.full(x.size, np.inf)
+        lower[:n], upper[:n] = SHARE_BOUNDS
+        negative = x[n : 2 * n] < 0.0
+        lower[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[1], EXPONENT_BOUNDS[0])
+        upper[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[0], EXPONENT_BOUNDS[1])
+        if self.electric:
+            lower[2 * n], upper[2 * n] = PERMITTIVITY_BOUNDS
+        return lower, upper
+
     def by_parameters(self, x: Array, by_mu: Array, by_alpha: Array, by_eps: Array) -> Array:
         """Derivatives by x (..., P) from those by mu, alpha (both (..., N)) and eps_r (...); nuisances get 0."""
         n = self.terms
@@ -191,11 +208,18 @@ class Problem:
 
     def states(self, x: Array) -> States:
         """The model at the nodes, errors of the displacement included and force zeros not."""
-        return self._solve([self.film(x)], self._shift(x[None]))[0]
+        return self._one(x).states[0]
+
+    def at_rest(self, x: Array) -> Array:
+        """The model's force at the nodes at 0 V; where there is none, that at the curves' own voltages."""
+        specimens = np.empty((len(self.active), 1), dtype=np.object_)
+        specimens[:, 0] = [self.curves[i].specimen.with_material(self.film(x)) for i in self.active]
+        force = solve_many(specimens, self.nodes, tolerance=self.tolerance).force
+        return np.where(np.isfinite(force), force, self.states(x).force)
 
     def project(self, at_nodes: Array) -> Array:
         """Weighted residual rows of changes of the force at the nodes, (..., rows, nodes, P); nuisances get 0."""
-        rows = [root @ at_nodes[..., row, :, :] for root, row in zip(self._roots, self.block_rows, strict=True)]
+        rows = [root @ at_nodes[..., row, :, :] for root, row in zip(self.roots, self.block_rows, strict=True)]
         nothing = np.zeros((*at_nodes.shape[:-3], len(self.nuisances), at_nodes.shape[-1]))
         return np.concatenate([*rows, nothing], axis=-2)
 
@@ -221,7 +245,7 @@ class Problem:
         answered = np.asarray(np.isfinite(force).all(axis=(1, 2)))
         residual[~answered] = INVALID_RESIDUAL
         jacobian[~answered] = 0.0
-        return Evaluation(residual, jacobian, answered)
+        return Evaluation(residual, jacobian, answered, solved)
 
     def samples(self, row: int, x: Array, states: States) -> tuple[Array, Array, Array]:
         """Of the used samples of a row: residual (measured minus model, N), its deviation, displacement."""

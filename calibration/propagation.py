@@ -52,6 +52,20 @@ def secant_modulus(material: Material, meridional: float, hoop: float) -> float:
     return float(secant(mu, alpha, np.array([meridional]), hoop)[0][0])
 
 
+def least_tangent(material: Material, meridional: float, hoop: float) -> float:
+    r"""Smallest tangent modulus (Pa) for stretches from 1 to ``meridional`` and ``hoop``; above 0 in a stable film.
+
+    The smaller eigenvalue of the second derivatives of W by the logarithms of the two stretches (Drucker, Hill).
+    With every ``mu_n alpha_n > 0`` it is positive whatever the stretch.
+    """
+    mu, alpha = np.array(material.mu), np.array(material.alpha)
+    one, two = (np.log(np.linspace(1.0, end, 25)) for end in (max(meridional, 1.0), max(hoop, 1.0)))
+    l1, l2 = (grid[..., None] for grid in np.meshgrid(one, two))
+    own1, own2, shared = (np.exp(alpha * power) @ (mu * alpha) for power in (l1, l2, -(l1 + l2)))
+    mean, half = 0.5 * (own1 + own2) + shared, 0.5 * (own1 - own2)
+    return float((mean - np.hypot(half, shared)).min())
+
+
 def secant(mu: Array, alpha: Array, meridional: Array, hoop: float) -> tuple[Array, Array, Array]:
     """Secant modulus at k meridional stretches, with derivatives by mu and by alpha; shapes (k,), (k, N), (k, N)."""
     l1 = meridional[:, None]
@@ -89,7 +103,7 @@ class Propagation:
     """Standard uncertainties of functions of the film's parameters, part by part.
 
     ``misfit`` is the chi-square of the lack of fit over its expectation; ``rivals`` are other minima with their
-    likelihood relative to this one.
+    likelihood relative to this one; ``suspect`` is the change of the residuals by an imperfection that was found.
     """
 
     def __init__(
@@ -99,11 +113,13 @@ class Propagation:
         free: NDArray[np.bool_],
         misfit: float,
         rivals: Sequence[tuple[Material, float]],
+        suspect: Array | None,
     ) -> None:
         self.problem = problem
         self.film = problem.film(x)
         self.covariance = Covariance(problem.jacobian(x), free)
         self.misfit = misfit
+        self.bias = None if suspect is None else self.covariance.response @ suspect
         self.rivals = rivals
         self.effects: dict[str, Array] = {}
         states = problem.states(x)
@@ -149,11 +165,20 @@ class Propagation:
             mine = [data + k for k, nuisance in enumerate(self.problem.nuisances) if nuisance.kind == kind]
             if mine:
                 parts[kind.replace("_", " ")] = float(np.linalg.norm(rows[mine]))
-        if self.misfit > 1.0:
-            parts["lack of fit"] = parts["noise"] * math.sqrt(self.misfit - 1.0)
+        bias = 0.0 if self.bias is None else float(gradient @ self.bias)
+        if self.misfit > 1.0 or self.bias is not None:
+            parts["lack of fit"] = math.hypot(parts["noise"] * math.sqrt(max(0.0, self.misfit - 1.0)), bias)
         for part, effect in self.effects.items():
             parts[part] = abs(float(gradient @ effect))
         return parts
+
+
+def determined(problem: Problem, at_bound: NDArray[np.bool_], held: Collection[str]) -> NDArray[np.bool_]:
+    """Entries of x that the data bear on: not held, and not the exponent of a term without stiffness."""
+    n = problem.terms
+    free = np.array([name not in held for name in problem.names])
+    free[n : 2 * n] &= ~at_bound[:n]
+    return free
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,13 +202,17 @@ def state(
     *,
     misfit: float = 1.0,
     rivals: Sequence[tuple[Material, float]] = (),
+    suspect: Array | None = None,
 ) -> Statement:
-    """Quantities with uncertainties at ``x``; ``at_bound`` marks entries of x, ``held`` names those that were given."""
+    """Quantities with uncertainties at ``x``; ``at_bound`` marks entries of x, ``held`` names those that were given.
+
+    ``suspect`` is what an imperfection that was found (`calibration.misfit`) does to the weighted residuals; what it
+    does to the results is part of their uncertainty.
+    """
     n = problem.terms
-    vanished = at_bound[:n]  # a term without stiffness says nothing about its exponent
-    free = np.array([name not in held for name in problem.names])
-    free[n : 2 * n] &= ~vanished
-    propagation = Propagation(problem, x, free, misfit, rivals)
+    vanished = at_bound[:n]
+    free = determined(problem, at_bound, held)
+    propagation = Propagation(problem, x, free, misfit, rivals, suspect)
     film = propagation.film
     mu, alpha = np.array(film.mu), np.array(film.alpha)
     zero, unit = np.zeros(n), np.eye(n)
@@ -221,6 +250,7 @@ def state(
     ]
     at = min(range(len(along)), key=lambda k: along[k].relative)
     quantities["stiffness"] = along[at]
+    quantities["stiffness_end"] = along[-1]
     if problem.electric and "eps_r" not in held:
         slopes["eps_r"] = gradient(zero, zero, 1.0)
         quantities["eps_r"] = propagation.quantity(

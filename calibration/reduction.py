@@ -206,14 +206,24 @@ def reference_voltage(curve: Curve, used: NDArray[np.bool_]) -> float:
 class Block:
     """Samples of one part of a curve in one direction, reduced: ``chi2 = |root @ f - target|^2 + floor``.
 
-    ``samples`` is their number, ``noise`` their residuals to the smooth curve nearest to them, in standard deviations.
+    ``rows`` are their places in the curve and ``way`` their direction. ``base`` reduces them:
+    ``target = base.T @ (force / sigma)``. ``noise`` are their residuals to the smooth curve nearest to them, in
+    standard deviations.
     """
 
-    samples: int
+    rows: NDArray[np.intp]
+    way: int
+    sigma: Array  # (samples,)
+    base: Array  # (samples, k)
     root: Array  # (k, nodes)
     target: Array  # (k,)
     floor: float
     noise: Array  # (samples,)
+
+    @property
+    def samples(self) -> int:
+        """How many there are."""
+        return int(self.rows.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +243,8 @@ def reduce(curve: Curve, used: NDArray[np.bool_], nodes: Array, voltage: float, 
     """
     blocks = []
     for direction in (1, 0, -1):
-        rows = used & (curve.direction == direction)
-        if not rows.any():
+        rows = np.flatnonzero(used & (curve.direction == direction))
+        if rows.size == 0:
             continue
         matrix = interpolation_matrix(nodes, curve.h[rows])
         force = curve.force[rows]
@@ -249,7 +259,10 @@ def reduce(curve: Curve, used: NDArray[np.bool_], nodes: Array, voltage: float, 
         noise = force - base @ target
         blocks.append(
             Block(
-                samples=int(rows.sum()),
+                rows=rows,
+                way=direction,
+                sigma=sigma,
+                base=base,
                 root=root,
                 target=target,
                 floor=float(noise @ noise),

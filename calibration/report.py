@@ -123,15 +123,16 @@ def _render(
     )
 
 
-_SYMBOLS = {"mu": "μ", "alpha": "α", "eps_r": "ε", "stiffness": "G", "G": "G"}
+_SYMBOLS = {"mu": "μ", "alpha": "α", "eps_r": "ε", "stiffness": "G", "stiffness_end": "G", "G": "G"}
 
 
 def _row(name: str, quantity: Quantity, known: Mapping[str, float]) -> _Row:
     base = name.rstrip("0123456789")
-    subscript = {"eps_r": "r", "stiffness": "s"}.get(name, name[len(base) :])
+    subscript = {"eps_r": "r", "stiffness": "s", "stiffness_end": "end"}.get(name, name[len(base) :])
     meaning = {
         "eps_r": "relative permittivity",
         "stiffness": "stiffness: secant shear modulus where the data determine it best",
+        "stiffness_end": "secant shear modulus at the largest stretch",
         "G": "small-strain shear modulus",
         "mu": "Ogden modulus",
         "alpha": "Ogden exponent",
@@ -172,6 +173,9 @@ def _truth(identification: Identification, truth: Material | None) -> dict[str, 
         "G": truth.shear_modulus,
         "eps_r": truth.eps_r,
         "stiffness": secant_modulus(truth, *identification.stretch),
+        "stiffness_end": secant_modulus(
+            truth, identification.stiffness_curve.meridional_stretch[-1], identification.stretch[1]
+        ),
     }
     if len(truth.mu) == identification.terms:
         for n, (alpha, mu) in enumerate(sorted(zip(truth.alpha, truth.mu, strict=True)), start=1):

@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+from calibration.held_out import HeldOut
+from calibration.misfit import Suspect
 from model.materials import Material
 
 CONVENTION = "W = sum mu_n/alpha_n (l1^alpha_n + l2^alpha_n + (l1 l2)^-alpha_n - 3), G = 1/2 sum mu_n alpha_n"
@@ -103,13 +105,17 @@ class Identification:
     stretch : (float, float)
         Meridional and hoop stretch to which ``stiffness`` belongs; see `secant_modulus`.
     stiffness_curve : Stiffness
-        The same over the range of stretch that the data reach.
+        The same over the range of stretch that the data reach; its last value is the quantity ``stiffness_end``.
+    least_tangent : float
+        Smallest tangent modulus (Pa) over the stretches reached; positive for a stable film.
     nuisance : dict of str to Zero
         Zeros of force (N) and displacement (m) of every run, as corrections to what was measured.
     chi_square, freedom : float, int
         Of all samples, in their stated standard deviations.
     lack_of_fit, lack_of_fit_freedom, lack_of_fit_probability : float, int, float
         Misfit that smooth curves would not have, in the noise found, and the probability of as much by chance.
+    suspects : list of Suspect
+        Known imperfections whose shape the residuals were held against, most probable first.
     noise_ratio : float
         Scatter about the nearest smooth curves over the stated standard deviation.
     samples_per_independent : float
@@ -122,18 +128,22 @@ class Identification:
         What speaks against the result; which further measurement would determine the Ogden terms better.
     aicc, bic : float
         Information criteria; smaller is better, differences below 2 mean nothing.
+    held_out : list of HeldOut
+        Predictions of curves from the others, where they were asked for.
     """
 
     material: Material
     quantities: dict[str, Quantity]
     stretch: tuple[float, float]
     stiffness_curve: Stiffness
+    least_tangent: float
     nuisance: dict[str, Zero]
     chi_square: float
     freedom: int
     lack_of_fit: float
     lack_of_fit_freedom: int
     lack_of_fit_probability: float
+    suspects: list[Suspect]
     noise_ratio: float
     samples_per_independent: float
     parameters: list[str]
@@ -147,6 +157,7 @@ class Identification:
     warnings: list[str]
     advice: list[str]
     provenance: dict[str, Any] = field(default_factory=dict)
+    held_out: list[HeldOut] = field(default_factory=list)
 
     @property
     def terms(self) -> int:
@@ -182,6 +193,7 @@ class Identification:
                 "secant_modulus_Pa": list(self.stiffness_curve.secant_modulus),
                 "standard_uncertainty_Pa": list(self.stiffness_curve.uncertainty),
             },
+            "least_tangent_modulus_Pa": self.least_tangent,
             "nuisance": {
                 name: {
                     "value": zero.value,
@@ -198,6 +210,16 @@ class Identification:
                 "chi_square": self.lack_of_fit,
                 "degrees_of_freedom": self.lack_of_fit_freedom,
                 "probability": self.lack_of_fit_probability,
+                "suspects": [
+                    {
+                        "name": one.name,
+                        "amplitude": one.amplitude,
+                        "standard_uncertainty": one.uncertainty,
+                        "unit": one.unit,
+                        "probability": one.probability,
+                    }
+                    for one in self.suspects
+                ],
             },
             "noise_ratio": self.noise_ratio,
             "samples_per_independent_sample": self.samples_per_independent,
@@ -208,6 +230,10 @@ class Identification:
             "condition_number": _finite(self.condition),
             "aicc": self.aicc,
             "bic": self.bic,
+            "held_out": [
+                {"what": one.what, "rms_residual_N": one.rms_residual, "rms_expected_N": one.rms_expected}
+                for one in self.held_out
+            ],
             "starts": self.starts,
             "starts_agreeing": self.starts_agreeing,
             "curves": [

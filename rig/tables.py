@@ -123,6 +123,9 @@ def truth_table(found: Found) -> RenderableType:
     known = {
         "eps_r": truth.eps_r,
         "stiffness": secant_modulus(truth, *identification.stretch),
+        "stiffness_end": secant_modulus(
+            truth, identification.stiffness_curve.meridional_stretch[-1], identification.stretch[1]
+        ),
         "G": truth.shear_modulus,
     }
     if len(truth.mu) == identification.terms:
@@ -161,4 +164,9 @@ def _with_unit(value: float, unit: str, digits: int) -> str:
     return f"{value:.{digits}g}" + (f" {unit}" if unit != "1" else "")
 
 
-_NAMES = {"eps_r": "permittivity eps_r", "stiffness": "stiffness the data determine", "G": "shear modulus G"}
+_NAMES = {
+    "eps_r": "permittivity eps_r",
+    "stiffness": "stiffness, best determined",
+    "stiffness_end": "stiffness, largest stretch",
+    "G": "shear modulus G",
+}

@@ -159,6 +159,7 @@ class Run:
                         voltage=self.voltage[rows],
                         nominal_voltage=voltage,
                         direction=direction,
+                        time=self.t[rows],
                         flagged=self.flagged[rows],
                         **{**self._zero_errors(float(self.t[rows[0]])), **errors},  # type: ignore[arg-type] # keys as above
                     )

@@ -414,28 +414,3 @@ def test_hopeless_data_are_refused_in_words(
 def test_no_curves_are_refused() -> None:
     with pytest.raises(IdentificationError, match="no curves"):
         identify([])
-
-
-# --- statistics over many experiments
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("terms", [1, 2])
-def test_coverage_of_the_stated_intervals(experiment: Experiment, terms: int) -> None:
-    """95 % intervals over 60 experiments whose zeros and gains are drawn from their stated uncertainties.
-
-    With 60 draws at 95 %, fewer than 52 hits has a probability of 0.3 %; z-values as large as these must also not be
-    much smaller than 1, or the uncertainties would be padded.
-    """
-    hits = {"eps_r": 0, "stiffness": 0}
-    scores: dict[str, list[float]] = {"eps_r": [], "stiffness": []}
-    for seed in range(60):
-        found = identify(experiment(seed=1000 + seed, samples=600, gains=True), terms=terms, starts=4)
-        for name, truth in (("eps_r", 1.7), ("stiffness", secant_modulus(PARKER, *found.stretch))):
-            z = deviation(found, name, truth)
-            hits[name] += z < 1.96
-            scores[name].append(z)
-    for name in hits:
-        assert hits[name] >= 52, (name, hits)
-        assert float(np.sqrt(np.mean(np.square(scores[name])))) > 0.6, name

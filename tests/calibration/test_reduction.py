@@ -128,7 +128,8 @@ def test_samples_without_value_flagged_before_contact_or_off_voltage_are_counted
 
 
 def noise_block(noise: np.ndarray) -> Block:
-    return Block(noise.size, np.zeros((16, 16)), np.zeros(16), float(noise @ noise), noise)
+    rows, zeros = np.arange(noise.size), np.zeros((16, 16))
+    return Block(rows, 1, np.ones_like(noise), zeros, zeros, np.zeros(16), float(noise @ noise), noise)
 
 
 def test_scatter_and_correlation_of_the_noise_are_measured() -> None:

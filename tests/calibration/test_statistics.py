@@ -1,0 +1,67 @@
+"""Many simulated experiments with known truth: do the intervals cover it, is a wrong model found out?"""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from calibration.curve import Curve
+from calibration.identify import identify, secant_modulus
+from calibration.result import Identification
+from model.materials import NAMED, Material
+
+Experiment = Callable[..., list[Curve]]
+
+PARKER = NAMED["parker-cao2018"]
+ONE_TERM = Material(name="one term", mu=(37_834.0,), alpha=(5.4985,), eps_r=1.7)
+NEAR = Material(name="near", mu=(12e3, 30e3), alpha=(3.0, 5.5), eps_r=2.0)
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+def reported(found: Identification) -> bool:
+    return any("the model does not explain the data" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize(("terms", "truth"), [(2, PARKER), (1, ONE_TERM)])
+def test_coverage_of_the_stated_intervals(experiment: Experiment, terms: int, truth: Material) -> None:
+    """200 experiments whose zeros and gains are drawn from their stated uncertainties: 90 to 99 % of the 95 % intervals
+    of permittivity and stiffness hold the truth, and a right model is hardly ever called wrong.
+    """
+    scores: dict[str, list[float]] = {"eps_r": [], "stiffness": []}
+    alarms = 0
+    guess = NEAR if terms == 2 else ONE_TERM
+    for seed in range(200):
+        curves = experiment(seed=1000 + seed, samples=120, gains=True, truth=truth, guess=guess)
+        found = identify(curves, terms=terms, starts=1)
+        alarms += reported(found)
+        for name, known in (("eps_r", truth.eps_r), ("stiffness", secant_modulus(truth, *found.stretch))):
+            scores[name].append((found.quantities[name].value - known) / found.quantities[name].uncertainty)
+    for name, z in scores.items():
+        covered = float(np.mean(np.abs(z) < 1.96))
+        assert 0.90 <= covered <= 0.99, (name, covered, np.std(z), np.mean(z))
+    assert alarms <= 10, alarms
+
+
+@pytest.mark.parametrize(
+    ("ratio", "tau", "compliance"),
+    [(0.03, 30.0, 0.0), (0.08, 4.0, 0.0), (0.0, 1.0, 8e-4), (0.03, 30.0, 3e-4)],
+)
+def test_a_wrong_model_that_biases_the_permittivity_is_found_out(
+    experiment: Experiment,
+    relaxed: Callable[..., list[Curve]],
+    ratio: float,
+    tau: float,
+    compliance: float,
+) -> None:
+    """Viscous film, rig that gives way, both: the permittivity is off by more than a right model would state for it."""
+    biases, stated, found_out = [], [], 0
+    for seed in range(40):
+        curves = experiment(seed=3000 + seed, samples=200, truth=ONE_TERM, guess=ONE_TERM)
+        found = identify(relaxed(curves, ONE_TERM, ratio, tau, compliance), terms=1, starts=1)
+        found_out += reported(found)
+        quantity = found.quantities["eps_r"]
+        biases.append(quantity.value - ONE_TERM.eps_r)
+        stated.append(np.hypot.reduce([size for part, size in quantity.budget.items() if part != "lack of fit"]))
+    assert abs(np.mean(biases)) > np.mean(stated)
+    assert found_out >= 38, (found_out, np.mean(biases) / np.mean(stated))
