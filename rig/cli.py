@@ -281,6 +281,15 @@ def benchmark_rates(full: bool, out: Path) -> None:
     _benchmark(rates.run, rates.render, "rates", full, out)
 
 
+@benchmark.command("safety")
+@_benchmark_options
+def benchmark_safety(full: bool, out: Path) -> None:
+    """How soon the voltage is off when the engine or the guard is killed or hangs, over real processes."""
+    from rig.benchmark import safety
+
+    _benchmark(safety.run, safety.render, "safety", full, out)
+
+
 def _benchmark(run: Callable[..., Any], render: Callable[..., Any], name: str, full: bool, out: Path) -> None:
     from rig.progress import progress
     from rig.tables import show

@@ -112,12 +112,12 @@ class IsegEDCP:
         self._asleep_until = -math.inf
         self._tick = math.floor(t / TICK + 1e-9)
 
-    def reset(self, t: float) -> None:
-        """Lose power and come back: output off at once, everything at power-up values."""
+    def reset(self, t: float, boot_s: float = 1.0) -> None:
+        """Lose power and come back: output off at once, everything at power-up values, deaf for ``boot_s``."""
         self._cut(t, self._settings.fall_time_s)
         self._power_up(t)
-        self._asleep_until = t + 1.0
-        self._next_logon = t + 1.1
+        self._asleep_until = t + boot_s
+        self._next_logon = t + boot_s + 0.1
 
     def freeze(self, t: float, frozen: bool) -> None:
         """A fault: measured voltage and current stay what they were at ``t``."""

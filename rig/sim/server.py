@@ -149,12 +149,13 @@ class Server:
             for role, port in self._ports.items()
         }
 
-    def run(self, stop: Callable[[], bool]) -> None:
-        """Serve until ``stop()`` is true; it is asked at least every 50 ms."""
+    def run(self, stop: Callable[[], bool], look: Callable[[], None] = lambda: None) -> None:
+        """Serve until ``stop()`` is true; it is asked at least every 50 ms. ``look`` is called each time too."""
         start = self._clock.now() - self._bench.now
         while not stop():
             now = self._clock.now() - start
             self._bench.advance(now)
+            look()
             for port in self._ports.values():
                 self._hand_over(port, now)
             open_ports = {port.master: port for port in self._ports.values() if port.is_open}

@@ -1,0 +1,228 @@
+"""How soon the high voltage is off when a process of ours dies or hangs: measured on the supply's own output.
+
+Engine and guard are real processes; the bench is served on pseudo-terminals by this one. What is measured therefore
+includes the system's scheduling, the adapter's lines and the simulated bus. POSIX only.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import random
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rig.benchmark.stand import Run, Stand
+from rig.errors import RigError
+from rig.safety.heartbeat import DEADLINE_S, INTERVAL_S
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+Progress = Callable[[float, str], None]  # share done, what is being done
+
+KILLED, STOPPED, SPINNING, GUARD = "engine killed", "engine stopped", "engine in a busy loop", "guard killed"
+BEATS = "interval between heartbeats"
+ALLOWED_MS = {KILLED: 50.0, STOPPED: 200.0, SPINNING: 200.0, GUARD: 200.0, BEATS: DEADLINE_S * 1e3}
+QUICK = {KILLED: 20, STOPPED: 6, SPINNING: 6, GUARD: 10}
+FULL = {KILLED: 200, STOPPED: 40, SPINNING: 40, GUARD: 60}
+LATEST_S = 10.0  # an output that is not commanded off by then never will be
+
+
+@dataclass
+class Row:
+    """One kind of trouble: milliseconds from it to the supply's being sent to zero, one a run that had voltage.
+
+    ``without`` counts runs that had none at that instant, ``never`` those whose output stayed on.
+    """
+
+    what: str
+    ms: list[float] = field(default_factory=list)
+    without: int = 0
+    never: int = 0
+
+    def quantile(self, share: float) -> float:
+        """Linear between the values; NaN when there are none."""
+        return float(np.quantile(self.ms, share)) if self.ms else math.nan
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the benchmark of safety found."""
+
+    full: bool
+    rows: list[Row]
+    environment: dict[str, str]
+
+
+def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None) -> Report:
+    """Measure, and write ``safety.json`` and ``safety.png``."""
+    numbers = FULL if full else QUICK
+    rows: list[Row] = []
+    total, done = sum(numbers.values()), 0
+    with TemporaryDirectory(prefix="dea-rig-safety-") as name, Stand(Path(name)) as stand:
+        beats = Row(BEATS)
+        whole = stand.start()
+        stand.wait_until_alone(whole)
+        if whole.status != 0:
+            raise RigError(f"A run that nobody disturbs failed: {whole.said}")
+        beats.ms += [1e3 * float(step) for step in np.diff(whole.beats)]
+        rng = random.Random(1)
+        for what, number in numbers.items():
+            row = Row(what)
+            rows.append(row)
+            for _ in range(number):
+                progress(done / total, what)
+                measure(stand, row, None, rng)
+                done += 1
+        rows.append(beats)
+    report = Report(full, rows, _environment())
+    save(report, out_dir)
+    return report
+
+
+def measure(stand: Stand, row: Row, instant: float | None, rng: random.Random) -> Run:
+    """One run with one trouble: at ``instant`` seconds after its start, or at random while it is live."""
+    run = stand.start()
+    if instant is None:
+        stand.wait_until_live(run)
+        instant = stand.bench.clock.now() - run.began + rng.uniform(0.0, 1.0)
+    due = run.began + instant
+    stand.wait(lambda: stand.bench.clock.now() >= due or run.status is not None, "the instant")
+    if run.status is not None:  # it was faster this time
+        row.without += 1
+        return run
+    pid = run.guard if row.what == GUARD else run.engine
+    number = {STOPPED: signal.SIGSTOP, SPINNING: signal.SIGUSR1}.get(row.what, signal.SIGKILL)
+    at = stand.kill(pid, number)
+    if not stand.was_on(at):
+        row.without += 1
+    else:
+        try:
+            stand.wait(lambda: stand.off_after(at) is not None, "the output's end", LATEST_S)
+            off = stand.off_after(at)
+            assert off is not None
+            row.ms.append(1e3 * (off.t - at))
+        except RigError:
+            row.never += 1
+    if row.what in (STOPPED, SPINNING):
+        stand.kill(run.engine)
+    stand.wait_until_alone(run)
+    return run
+
+
+def kill_many(folder: Path, number: int, at_once: int, seed: int) -> Row:
+    """``number`` engines killed at random instants across their runs, ``at_once`` of them side by side."""
+    rows = [Row(KILLED) for _ in range(at_once)]
+    errors: list[Exception] = []
+
+    def work(k: int) -> None:
+        rng = random.Random(seed * at_once + k)
+        try:
+            with Stand(folder / f"stand-{k}", hold_s=0.5) as stand:
+                whole = stand.start()
+                stand.wait_until_alone(whole)
+                duration = stand.bench.clock.now() - whole.began
+                for i in range(k, number, at_once):
+                    del i
+                    measure(stand, rows[k], rng.uniform(0.0, duration), rng)
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(at_once)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
+    return Row(
+        KILLED, [ms for row in rows for ms in row.ms], sum(row.without for row in rows), sum(row.never for row in rows)
+    )
+
+
+def _environment() -> dict[str, str]:
+    return {
+        "python": platform.python_version(),
+        "system": platform.system(),
+        "processors": str(os.cpu_count()),
+        "load": f"{os.getloadavg()[0]:.1f}",
+        "heartbeat_ms": f"{INTERVAL_S * 1e3:.0f}",
+        "deadline_ms": f"{DEADLINE_S * 1e3:.0f}",
+    }
+
+
+# ---- showing
+
+
+def save(report: Report, out_dir: Path) -> None:
+    """Write the report as JSON and a picture."""
+    out_dir.mkdir(parents=True, exist_ok=True)
+    content = {
+        "full": report.full,
+        "allowed_ms": ALLOWED_MS,
+        "rows": [asdict(row) for row in report.rows],
+        "environment": report.environment,
+    }
+    (out_dir / "safety.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    _draw(report, out_dir / "safety.png")
+
+
+def render(report: Report) -> RenderableType:
+    """A table for the terminal."""
+    from rich.console import Group
+    from rich.table import Table
+
+    table = Table(
+        title="From the trouble to the supply's output being sent to zero, in ms",
+        caption="Measured on the simulated supply; what a real one then needs to discharge comes on top.",
+    )
+    for heading in ("", "runs", "without HV", "median", "95 %", "longest", "allowed", "never off"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for row in report.rows:
+        beats = row.what == BEATS
+        times = (row.quantile(0.5), row.quantile(0.95), max(row.ms, default=math.nan), ALLOWED_MS[row.what])
+        table.add_row(
+            row.what,
+            str(len(row.ms)),
+            "" if beats else str(row.without),
+            *(f"{time:.1f}" for time in times),
+            "" if beats else str(row.never),
+        )
+    setting = ", ".join(f"{name} {value}" for name, value in report.environment.items())
+    return Group(table, f"Measured on: {setting}.")
+
+
+def _draw(report: Report, path: Path) -> None:
+    """Every measured time as a mark, a row a kind, with what is allowed."""
+    from matplotlib.figure import Figure
+
+    rows = report.rows[::-1]
+    figure = Figure(figsize=(8.0, 1.4 + 0.6 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    rng = np.random.default_rng(1)
+    for y, row in enumerate(rows):
+        times = np.array(row.ms)
+        axes.plot(times, y + rng.uniform(-0.18, 0.18, times.size), ".", color="#0072B2", alpha=0.5, markersize=5)
+        axes.plot([row.quantile(0.5)] * 2, [y - 0.3, y + 0.3], color="black", linewidth=2)
+        axes.plot([ALLOWED_MS[row.what]] * 2, [y - 0.4, y + 0.4], color="#D55E00", linewidth=2)
+    axes.plot([], [], ".", color="#0072B2", label="one run, or one interval")
+    axes.plot([], [], color="black", linewidth=2, label="median")
+    axes.plot([], [], color="#D55E00", linewidth=2, label="allowed")
+    axes.set_xscale("log")
+    axes.set_xticks([10, 20, 50, 100, 200], ["10", "20", "50", "100", "200"])
+    axes.minorticks_off()
+    axes.set_yticks(range(len(rows)), [row.what for row in rows])
+    axes.set_xlabel("time until the supply is sent to zero / ms (last row: interval / ms)")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(path, dpi=110)
