@@ -126,7 +126,7 @@ class Shvps:
         self._max_volts = math.nan
         self._ramp = ramp_V_per_s
         self._target = self._setpoint = 0
-        self._stepped_at = -math.inf
+        self._stepped_at: float | None = None  # None: with the next cycle a ramp begins
         self._on = self._emergency = False
         self._dialogue.begin(self._set_up())
 
@@ -334,6 +334,9 @@ class Shvps:
 
     def _step(self) -> _Part[None]:
         """Move the set-point towards the target by what the ramp allows since the last step; at least one volt."""
+        if self._stepped_at is None:
+            self._stepped_at = self._now
+            return
         elapsed = min(self._now - self._stepped_at, LONGEST_STEP_S)
         room = max(1, int(self._ramp * elapsed))
         change = max(-room, min(room, self._target - self._setpoint))
@@ -348,7 +351,7 @@ class Shvps:
             yield from self._set("Vset", 0)
             self._setpoint = 0
         self._target = volts
-        self._stepped_at = self._now
+        self._stepped_at = None
 
     def _switch_on(self) -> Script[str, str]:
         if self._on:

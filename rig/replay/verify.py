@@ -169,8 +169,8 @@ class _Rows:
 class _Stream:
     """What is known of one instrument while the log is gone through.
 
-    ``arrived`` and ``sent`` belong to the poll in the making, which was at ``t``; ``mark`` is where its stream stood
-    at its last sample but one, for the report.
+    ``arrived`` and ``sent`` belong to the poll in the making, which was at ``t``. ``since`` is what arrived since the
+    last sample, from ``offset`` on; it begins anew with the next poll after a sample (``fresh``).
     """
 
     t: float = math.nan
@@ -181,6 +181,7 @@ class _Stream:
     offset: int = 0
     fresh: bool = True
     error: str = ""
+    counted: bool = False
     samples: int = 0
     requests: int = 0
 
@@ -237,14 +238,16 @@ class _Verifier:
                 self._poll(row.fields["device"])
                 self._command(row.fields)
             case ["event"] if row.fields["source"] in self._streams:
-                self._poll(row.fields["source"])  # what comes after that is another poll, or the end
+                self._poll(row.fields["source"])
+                if row.fields["message"].startswith("counted: "):  # what comes after that is said in closing
+                    self._streams[row.fields["source"]].counted = True
             case ["reference"]:
                 self._reference(row.fields["name"], row.fields["value"])
 
     def _on_wire(self, role: str, way: str, t: float, data: bytes) -> None:
         """Everything read in a poll was read before anything was sent in it."""
         stream = self._streams[role]
-        if t != stream.t or (way == "rx" and stream.sent):
+        if not stream.counted and (t != stream.t or (way == "rx" and stream.sent)):
             self._poll(role)
         stream.t = t
         (stream.arrived if way == "rx" else stream.sent).append(data)
@@ -319,9 +322,8 @@ class _Verifier:
                 self._recorder.displacement_zero = value
 
     def _end(self, role: str) -> None:
-        """What was sent last in a run that was ended properly is what closing the device says."""
         stream = self._streams[role]
-        if stream.sent and not stream.arrived and self._recording.log.outcome is not None:
+        if stream.counted and self._recording.log.outcome is not None:
             self._bench.devices[role].close()
             self._compare_requests(role)
         else:
