@@ -194,6 +194,8 @@ def _read(source: Source, tables: dict[str, _Table]) -> Log:
             elif record.opcode == Opcode.METADATA:
                 name, table = scan.metadata(record)
                 _check_new(metadata, name)
+                if name == "log":
+                    _check_version(source.path, table.get("schema_version", ""))
                 metadata[name] = table
         except Damaged as why:
             scan.damaged(record, str(why))
@@ -329,6 +331,16 @@ def _decode(path: Path, topic: str, payload: bytes) -> dict[str, Any]:
         return schema.decode(topic, payload)
     except ValueError as error:
         raise LogError(path, str(error), "Another program wrote it, or wrote into it.") from error
+
+
+def _check_version(path: Path, version: str) -> None:
+    if version != str(schema.SCHEMA_VERSION):
+        raise LogError(
+            path,
+            f"it was written with schema version {version or '(unknown)'}, and this dea-rig reads version "
+            f"{schema.SCHEMA_VERSION}",
+            "Read it with the version of dea-rig that wrote it; its metadata names it.",
+        )
 
 
 def _check_new(found: dict[str, Any], name: str) -> None:

@@ -43,7 +43,8 @@ class Difference:
     step : str
         What the protocol was doing.
     offset : int
-        Where in all that the instrument sent the bytes begin that came since its last sample.
+        Where in all that the instrument sent the bytes begin that came since its last sample; a CAN frame counts as
+        the log has it, with two bytes for its identifier.
     data : bytes
         Those bytes.
     recorded, decoded : str
