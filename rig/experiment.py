@@ -123,6 +123,9 @@ def run(
             stop_on_signals(control, control.ask_pause),
         ):
             _attach(log, experiment, problems, _this_origin() if origin is None else origin)
+            if bench.guard_process is not None and isinstance(log, LogProcess):
+                bench.guard_process.log_to(out, log.second)
+                log.second.close()
             certificates = experiment.certificates
             engine = Engine(
                 bench,

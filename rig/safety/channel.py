@@ -34,6 +34,7 @@ class Channel:
         self._outbox = bytearray()
         self.closed = False
         self.thrown_away = 0
+        self.handles: list[int] = []  # file descriptors that came with messages, in order
 
     def fileno(self) -> int:
         """For ``select``."""
@@ -41,12 +42,15 @@ class Channel:
 
     def send(self, message: Message) -> None:
         """Send as soon as there is room; a peer that is gone is noticed, not told."""
-        body = json.dumps(message, separators=(",", ":")).encode()
         if len(self._outbox) > LARGEST_OUTBOX:
             self.thrown_away += 1
         else:
-            self._outbox += _HEAD.pack(len(body), zlib.crc32(body)) + body
+            self._outbox += _pack(message)
         self.flush()
+
+    def hand_over(self, message: Message, handle: int) -> None:
+        """Send a message with a file descriptor, before there is other traffic. POSIX only."""
+        socket.send_fds(self._socket, [_pack(message)], [handle])
 
     def flush(self) -> None:
         """Send what there is room for."""
@@ -71,7 +75,7 @@ class Channel:
         reset = False
         while self._socket.fileno() >= 0:
             try:
-                data = self._socket.recv(1 << 16)
+                data = self._read()
             except BlockingIOError:
                 break
             except ConnectionResetError:  # said once, ahead of what can still be read
@@ -94,6 +98,13 @@ class Channel:
         self.closed = True
         with suppress(OSError):
             self._socket.close()
+
+    def _read(self) -> bytes:
+        if not hasattr(socket, "recv_fds"):
+            return self._socket.recv(1 << 16)
+        data, handles, _, _ = socket.recv_fds(self._socket, 1 << 16, 4)
+        self.handles += handles
+        return data
 
     def _messages(self) -> list[Message]:
         messages: list[Message] = []
@@ -120,3 +131,8 @@ class Channel:
     def _damaged(self, what: str) -> ChannelDamaged:
         self.close()
         return ChannelDamaged(f"{what} between engine and guard")
+
+
+def _pack(message: Message) -> bytes:
+    body = json.dumps(message, separators=(",", ":")).encode()
+    return _HEAD.pack(len(body), zlib.crc32(body)) + body

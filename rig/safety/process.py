@@ -21,6 +21,7 @@ import socket
 import sys
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import click
@@ -30,10 +31,13 @@ from drivers.roles import HVSample, HVSupply
 from rig.clock import RealClock
 from rig.errors import FaultError, LimitError
 from rig.host import HostTime
+from rig.log.errors import LogError
+from rig.log.remote import RemoteLog
+from rig.recorder import Severity
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import ADVICE, AT_ONCE_S, SAFE_VOLTAGE, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
-from rig.safety.supply import Link, SupplyTable, make_driver, open_link
+from rig.safety.supply import ROLE, Link, SupplyTable, make_driver, open_link
 from rig.scene import Scene
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005
@@ -77,6 +81,7 @@ def serve(end: socket.socket, configured: bytes) -> None:
         server.run()
     finally:
         link.close()
+        server.close()
         channel.close()
 
 
@@ -104,6 +109,7 @@ class Server:
         self._guard: Guard | None = None
         self._gain = 1.0
         self._polled_at = 0.0
+        self._log: RemoteLog | None = None
         self._next_state = 0.0
         self._again = 0.0
         self._off_at: float | None = None  # when the output was first taken off
@@ -121,6 +127,11 @@ class Server:
             self._wait()
         if self._guard is not None and self._guard.commanded and not self._dismissed:
             self._leave(self._guard)
+
+    def close(self) -> None:
+        """Let go of the log."""
+        if self._log is not None:
+            self._log.close()
 
     # The loop ------------------------------------------------------------------------------------------------
 
@@ -149,10 +160,7 @@ class Server:
         self._polled_at = self._clock.now()  # all the time that the driver knows: what passes on its wire bears it
         for raw in supply.poll(self._polled_at):
             assert isinstance(raw, HVSample)
-            self._channel.send(
-                {"is": "sample", "values": [raw.t, raw.voltage, raw.current, raw.setpoint, raw.flags.value]}
-            )
-            self._next_state = 0.0
+            self._tell_sample(raw)
             guard.on_sample(self._by_certificate(raw))
 
     def _by_certificate(self, sample: HVSample) -> HVSample:
@@ -160,6 +168,7 @@ class Server:
 
     def _wait(self) -> None:
         now = self._clock.now()
+        self._tick_log(now)
         due = self._supply.next_poll if self._supply is not None else now + LONGEST_TURN_S
         wait = min(max(due - now, SHORTEST_TURN_S), LONGEST_TURN_S)
         if self._channel.closed:
@@ -202,7 +211,7 @@ class Server:
         elif now - self._off_at > AT_ONCE_S and not self._told_not_safe:
             self._told_not_safe = True
             message = f"NOT SAFE: the output was not measured below {SAFE_VOLTAGE:.0f} V. {ADVICE}"
-            self._channel.send({"is": "event", "severity": "error", "message": message})
+            self._tell_event("error", message)
             _say(f"dea-rig guard: {message}")
         elif now >= self._again:
             self._off(guard, guard.cause)
@@ -218,6 +227,8 @@ class Server:
                 self._answer(message)
             case "appoint":
                 self._appoint(message)
+            case "log":
+                self._log = RemoteLog(Path(message["path"]), socket.socket(fileno=self._channel.handles.pop(0)))
             case "close":
                 self._dismissed = True
             case other:
@@ -270,10 +281,47 @@ class Server:
         )
 
     def _tell_wire(self, role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:
-        self._channel.send({"is": "wire", "way": way, "data": data.hex(), "t": t})
+        if not self._record(f"/raw/{role}/{way}", t, data=data):
+            self._channel.send({"is": "wire", "way": way, "data": data.hex(), "t": t})
 
     def _tell_command(self, command: str, argument: str) -> None:
-        self._channel.send({"is": "command", "command": command, "argument": argument, "t": self._clock.now()})
+        t = self._clock.now()
+        if not self._record("/command", t, device=ROLE, command=command, argument=argument):
+            self._channel.send({"is": "command", "command": command, "argument": argument, "t": t})
+
+    def _tell_event(self, severity: Severity, message: str) -> None:
+        if not self._record("/event", self._clock.now(), severity=severity, source="guard", message=message):
+            self._channel.send({"is": "event", "severity": severity, "message": message})
+
+    def _tell_sample(self, raw: HVSample) -> None:
+        if not self._channel.closed:
+            values = [raw.t, raw.voltage, raw.current, raw.setpoint, raw.flags.value]
+            self._channel.send({"is": "sample", "values": values})
+            self._next_state = 0.0
+            return
+        one = self._by_certificate(raw)
+        fields = {"voltage_V": one.voltage, "current_A": one.current, "setpoint_V": one.setpoint}
+        self._record("/hv/sample", one.t, **fields, flags=one.flags.value)
+
+    # The log ---------------------------------------------------------------------------------------------------
+
+    def _record(self, topic: str, t: float, **fields: object) -> bool:
+        """Write to our own end of the log; False when we have none, or none any more."""
+        if self._log is None:
+            return False
+        epoch_ns = self._clock.epoch_ns
+        try:
+            self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), epoch_ns(t))
+        except LogError:  # the engine meets the same error at its own end, and ends the run for it
+            self._log = None
+        return self._log is not None
+
+    def _tick_log(self, now: float) -> None:
+        if self._log is not None:
+            try:
+                self._log.tick(now)
+            except LogError:
+                self._log = None
 
     # The end ---------------------------------------------------------------------------------------------------
 
@@ -295,9 +343,11 @@ class Server:
             self._wait()
         measured = guard.last.voltage if guard.last is not None else float("nan")
         if guard.output_is_safe:
-            _say(f"dea-rig guard: {cause}. The high voltage is off, measured {measured:.0f} V.")
+            message = f"{cause}. The high voltage is off, measured {measured:.0f} V."
         else:
-            _say(f"dea-rig guard: {cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {ADVICE}")
+            message = f"{cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {ADVICE}"
+        self._tell_event("error", message)
+        _say(f"dea-rig guard: {message}")
 
 
 def _say(text: str) -> None:

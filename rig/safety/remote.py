@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import get_context
 from multiprocessing.util import Finalize
+from pathlib import Path
 from typing import Any
 
 from drivers.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
@@ -31,8 +32,8 @@ from rig.safety.supply import ROLE, Link, make_driver, open_link
 from rig.scene import IsegTable, Scene
 
 START_S = 30.0  # until the process must have opened the link; a slow disk has many modules to read
-ANSWER_S = 0.5  # a guard that takes longer to answer is lost
-SILENCE_S = 0.5  # ... and one that says nothing for this long: it sends its state twenty times a second
+ANSWER_S = 1.0  # a guard that takes longer to answer is lost
+SILENCE_S = 1.0  # ... and one that says nothing for this long: it sends its state twenty times a second
 OPEN_AGAIN_S = 0.1
 LEAVE_S = 2.0
 
@@ -123,11 +124,17 @@ class RemoteGuard:
             if self._lost or self._clock.now() > end:
                 raise FaultError(f"hv: the guard's process did not start ({self._lost or 'it says nothing'}).")
             select.select([self._channel], [], [], 0.1)
-        self._heard_at = self._clock.now()
 
     def attach(self, tap: Tap) -> None:
         """From now on bytes and frames are told to ``tap``."""
         self._tap = tap
+
+    def log_to(self, path: Path, end: socket.socket) -> None:
+        """Give the process its own end of the log at ``path``: what it does is recorded even if this process dies.
+
+        POSIX only; before `appoint`. The end may be closed here afterwards.
+        """
+        self._channel.hand_over({"do": "log", "path": str(path)}, end.fileno())
 
     def appoint(
         self,
@@ -149,8 +156,9 @@ class RemoteGuard:
         event : callable
             ``event(severity, message)`` for what the guard has to say itself.
         """
-        self._tell, self._event, self._fresh = tell, event, dict(fresh)
-        self._channel.send({"do": "appoint", "gain": gain, "fresh": self._fresh})
+        self._tell, self._event = tell, event
+        self._channel.send({"do": "appoint", "gain": gain, "fresh": dict(fresh)})
+        self._heard_at = self._clock.now()  # it has had nothing to say until now
 
     # As a device ---------------------------------------------------------------------------------------------
 
