@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, label
-from drivers.link import CanFrame, DeviceRefused, DeviceSilent, FrameLink
+from drivers.link import CanFrame, DeviceRefused, FrameLink
 from drivers.roles import ForceSample, Identity, SampleFlag
-from drivers.sample_clock import SampleClock
+from drivers.stream import Stream
 
 PROFILE = 404
 FLOAT_VALUE, INT16_VALUE, INT24_VALUE, INT32_VALUE, STATUS = 0x6130, 0x7130, 0x8130, 0x9130, 0x6150
@@ -361,15 +361,13 @@ class CiA404:
             advice=f"Check power, CAN cable and termination, bit rate, and that the device is node {node}.",
         )
         self._layout = Layout((), channel)
-        self._clock: SampleClock[ForceSample] | None = None
-        self._heard = math.inf
+        self._stream: Stream | None = None
         self._emergency = 0
-        self._polls = 0
         self._next_poll = -math.inf
 
     @property
     def ready(self) -> bool:
-        return self._clock is not None
+        return self._stream is not None
 
     @property
     def rate(self) -> float:
@@ -395,7 +393,7 @@ class CiA404:
     def poll(self, now: float) -> Sequence[ForceSample]:
         self._next_poll = now + LOST_AGAIN_S
         frames = self._link.read()
-        if self._clock is None and self._dialogue.idle:
+        if self._stream is None and self._dialogue.idle:
             frames = []
             self._link.write(nmt(self._node, "pre-operational"))
             self._dialogue.begin(self._set_up())
@@ -405,7 +403,7 @@ class CiA404:
                 case None:
                     pass
                 case ProcessData(data):
-                    if self._clock is None or len(data) != self._layout.length:
+                    if self._stream is None or len(data) != self._layout.length:
                         self.counters["ignored_frames"] += 1
                     else:
                         arrived.append(self._sample(data))
@@ -419,10 +417,10 @@ class CiA404:
                     if not self._dialogue.offer(answer, now):
                         self.counters["unexpected_answers"] += 1
         self._dialogue.run(now)
-        self._polls += 1
-        spread = 0.5 + 0.5 * (self._polls * 0.6180339887498949 % 1.0)  # out of step with the stream, as for GSV-8
-        self._next_poll = min(now + self._interval * spread, self._dialogue.next_poll(now))
-        return self._stamp(now, arrived)
+        stream = self._stream
+        look = now + self._interval if stream is None else stream.next_poll(now)
+        self._next_poll = min(look, self._dialogue.next_poll(now))
+        return [] if stream is None else stream.take(now, arrived)
 
     # -- stream -----------------------------------------------------------------------------------------------------
 
@@ -443,37 +441,14 @@ class CiA404:
         return ForceSample(math.nan, reading, flags)
 
     def _check_state(self, state: int) -> None:
-        if state != 0 or self._clock is None:
+        if state != 0 or self._stream is None:
             return
-        self._clock = None  # set up again if somebody goes on polling
+        self._stream = None  # set up again if somebody goes on polling
         raise DeviceRefused(
             self._label,
             "has restarted by itself (boot-up message) and stopped measuring",
             "Check its supply. Its tare and settings may be gone.",
         )
-
-    def _stamp(self, now: float, arrived: list[ForceSample]) -> list[ForceSample]:
-        clock = self._clock
-        if clock is None:
-            return []
-        self._heard = min(self._heard, now)
-        samples = [ForceSample(t, s.reading, s.flags) for t, s in clock.feed(now, arrived)]
-        if arrived:
-            self._heard = now
-        elif now - self._heard > max(self._timeout, 5.0 / self._rate):
-            silent_s, self._heard = now - self._heard, now
-            raise DeviceSilent(
-                self._label,
-                f"no valid process value for {silent_s:.2f} s though the node was started",
-                "Check the device and its cable; it may have been switched off or stopped.",
-            )
-        if (rate := clock.other_rate()) is not None:
-            raise DeviceRefused(
-                self._label,
-                f"sends at {rate:.4g} Hz although {self._rate:.4g} Hz were set",
-                "Its event timer may be coarser, or the bus loses frames.",
-            )
-        return samples
 
     # -- dialogue ---------------------------------------------------------------------------------------------------
 
@@ -519,8 +494,7 @@ class CiA404:
         yield from self._set_timer()
         self._emergency = 0
         self._link.write(nmt(self._node, "start"))
-        self._clock = SampleClock(self._rate, self.counters)
-        self._heard = math.inf  # the poll that follows sets it
+        self._stream = Stream(self._label, self._rate, self._timeout, self._interval, self.counters)
 
     def _read_unit(self) -> Generator[_Step, _Got, None]:
         code = yield from self._read(UNIT, self._channel, 4)

@@ -31,9 +31,9 @@ from typing import Literal
 
 from drivers.dialogue import LOST_AGAIN_S, Ask, Dialogue, label
 from drivers.dialogue import Answer as Answered
-from drivers.link import ByteLink, DeviceRefused, DeviceSilent
+from drivers.link import ByteLink, DeviceRefused
 from drivers.roles import ForceSample, Identity, SampleFlag
-from drivers.sample_clock import SampleClock
+from drivers.stream import Stream
 
 FrameType = Literal["int16", "int24", "float32"]
 
@@ -350,14 +350,13 @@ class GSV8:
         self._gain = math.nan
         self._offset = 0.0
         self._limit = _UNKNOWN_RANGE_LIMIT
-        self._clock: SampleClock[ForceSample | None] | None = None
-        self._heard = 0.0
-        self._polls = 0
+        self._stream: Stream | None = None
+        self._fresh = True
         self._next_poll = -math.inf
 
     @property
     def ready(self) -> bool:
-        return self._clock is not None
+        return self._stream is not None
 
     @property
     def rate(self) -> float:
@@ -384,25 +383,23 @@ class GSV8:
     def poll(self, now: float) -> Sequence[ForceSample]:
         self._next_poll = now + LOST_AGAIN_S
         data = self._link.read()
-        if self._polls == 0:
+        if self._fresh:
             data = b""  # whatever was in the line belongs to an earlier conversation
-        self._polls += 1
-        if self._clock is None and self._dialogue.idle:
+        self._fresh = False
+        if self._stream is None and self._dialogue.idle:
             self._decoder.expect_any()
             self._dialogue.begin(self._set_up())
         arrived: list[ForceSample | None] = []
         for message in self._decoder.feed(data):
-            if isinstance(message, Measured) and self._clock is not None:
+            if isinstance(message, Measured) and self._stream is not None:
                 arrived.append(self._sample(message))
             elif not self._dialogue.offer(message, now):
                 self.counters["ignored_frames" if isinstance(message, Measured) else "unexpected_answers"] += 1
         self._dialogue.run(now)
-        # The golden ratio spreads the polls evenly over the sample period, whatever the two rates are.
-        spread = 0.5 + 0.5 * (self._polls * 0.6180339887498949 % 1.0)
-        if self._clock is not None and not self._clock.acquired:
-            spread *= 0.2  # finds the phase of the stream sooner
-        self._next_poll = min(now + self._interval * spread, self._dialogue.next_poll(now))
-        return self._stamp(now, arrived)
+        stream = self._stream
+        look = now + self._interval if stream is None else stream.next_poll(now)
+        self._next_poll = min(look, self._dialogue.next_poll(now))
+        return [] if stream is None else stream.take(now, arrived)
 
     # -- stream -----------------------------------------------------------------------------------------------------
 
@@ -420,29 +417,6 @@ class GSV8:
             self.counters["bad_values"] += 1
             return None
         return ForceSample(math.nan, reading, flags)
-
-    def _stamp(self, now: float, arrived: list[ForceSample | None]) -> list[ForceSample]:
-        clock = self._clock
-        if clock is None:
-            return []
-        self._heard = min(self._heard, now)
-        samples = [ForceSample(t, s.reading, s.flags) for t, s in clock.feed(now, arrived) if s is not None]
-        if any(s is not None for s in arrived):
-            self._heard = now
-        elif now - self._heard > max(self._timeout, 5.0 / self._rate):
-            silent_s, self._heard = now - self._heard, now
-            raise DeviceSilent(
-                self._label,
-                f"no valid measured value for {silent_s:.2f} s though the stream was started",
-                "Check the amplifier and its cable; it may have been switched off or reset.",
-            )
-        if (rate := clock.other_rate()) is not None:
-            raise DeviceRefused(
-                self._label,
-                f"streams at {rate:.4g} Hz although {self._rate:.4g} Hz were set",
-                "The amplifier may have been reset, or the line loses data.",
-            )
-        return samples
 
     # -- dialogue ---------------------------------------------------------------------------------------------------
 
@@ -502,7 +476,7 @@ class GSV8:
         self.settings["data_rate_Hz"] = f"{rate:.9g}"
         yield from self._check_frame()
         yield from self._demand(START_TRANSMISSION)
-        self._start()
+        self._stream = Stream(self._label, self._rate, self._timeout, self._interval, self.counters)
 
     def _read_scaling(self, channel: bytes) -> Generator[_Step, _Got, None]:
         reply = yield from self._ask(GET_INPUT_TYPE, channel + b"\xff", lengths=(5,))
@@ -564,10 +538,6 @@ class GSV8:
         self.settings["frame_type"] = frame.type
         self.settings["channels"] = str(len(frame.values))
         self.settings["channel"] = str(self._channel)
-
-    def _start(self) -> None:
-        self._clock = SampleClock(self._rate, self.counters)
-        self._heard = math.inf  # the poll that follows sets it
 
     def _zero(self) -> Generator[_Step, _Got, None]:
         yield from self._demand(SET_ZERO, bytes((self._channel,)))

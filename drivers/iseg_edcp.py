@@ -428,7 +428,7 @@ class IsegEDCP:
         self._collected: dict[int, Message] = {}
         self._nominal = (math.nan, math.nan)
         self._channels = 1
-        self._ready = False
+        self._ready = self._lost_settings = False
         self._commands = 0
         self._samples: list[HVSample] = []
         self._next_survey = -math.inf
@@ -543,8 +543,7 @@ class IsegEDCP:
             if isinstance(message, LogOn):
                 self.counters["log_ons"] += 1
                 self._link.write(log_on(self._module))
-                if self._ready:  # it may have been switched off and on, and lost what was set
-                    self._dialogue.begin(self._read_settings())
+                self._lost_settings = True  # it may have been switched off and on, and lost what was set
             elif message is not None and not self._dialogue.offer(message, now) and not self._collect(message):
                 self.counters["unexpected_frames"] += 1
         if self._dialogue.idle:
@@ -709,6 +708,9 @@ class IsegEDCP:
         module = yield from self._integer(MODULE_STATUS)
         flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module))
         self._samples.append(HVSample(t, voltage, current, setpoint, flags))
+        if self._lost_settings:
+            self._lost_settings = False
+            yield from self._read_settings()
         if self._channels > 1 and now >= self._next_survey:
             self._next_survey = now + _SURVEY_S
             yield from self._survey()

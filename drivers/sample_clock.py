@@ -109,10 +109,11 @@ class SampleClock(Generic[T]):
         if 0.5 * elapsed - slack <= given <= 1.05 * elapsed + slack:
             return None
         rate = self._counted / elapsed if elapsed > 0 else math.inf
-        self._count_anew()
+        self.count_anew()
         return rate
 
-    def _count_anew(self) -> None:
+    def count_anew(self) -> None:
+        """Forget how many samples have come: `other_rate` judges what comes from now on."""
         self._counted_since, self._counted = self._now, 0
 
     def feed(self, now: float, samples: list[T]) -> list[tuple[float, T]]:
@@ -123,7 +124,7 @@ class SampleClock(Generic[T]):
         self._counted += len(samples)
         if self._last is None:
             self._last = now
-            self._count_anew()
+            self.count_anew()
             self._open_window(now)
             return [(now - (len(samples) - 1 - i) * self._period, sample) for i, sample in enumerate(samples)]
         self._held += samples
@@ -155,7 +156,7 @@ class SampleClock(Generic[T]):
         if gap:
             self._acquired = False
             self._open_window(now)
-            self._count_anew()
+            self.count_anew()
         else:
             self._track(now, n, late)
         return stamped
@@ -211,5 +212,5 @@ class SampleClock(Generic[T]):
         self._last += min(_PHASE_GAIN * self._window_least, 0.5 * self._nominal)
         self._acquired = True
         if now - self._counted_since > _COUNT_S:
-            self._count_anew()
+            self.count_anew()
         self._open_window(now)

@@ -26,6 +26,8 @@ AnyGuard: TypeAlias = "Guard | RemoteGuard"  # in the engine's process, or in on
 SAFE_VOLTAGE = 60.0  # V; below this the discharge is harmless (EN 50191 names 60 V DC)
 DEVIATION_V, DEVIATION_PART = 50.0, 0.05  # a settled output this far from its set-point has sagged or risen ...
 DEVIATION_SAMPLES = 2  # ... when this many samples in a row say so
+FROZEN_SAMPLES = 25  # this many equal measurements of voltage and current in a row: last digits are never so quiet
+FROZEN_RAMP_V, FROZEN_RAMP_SAMPLES = 100.0, 3  # nor does a ramp over so much leave so many voltages equal
 FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
 AT_ONCE_S = 5.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
 ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
@@ -85,6 +87,8 @@ class Guard:
         self._next_film_check = -math.inf
         self._low_samples = 0
         self._deviating_samples = 0
+        self._equal_samples = 0
+        self._equal_since: tuple[HVSample, bool] | None = None  # and whether the output was to move
         self._seen_on = False
         self.last: HVSample | None = None
 
@@ -261,11 +265,14 @@ class Guard:
         Raises
         ------
         LimitError, FaultError
-            When voltage or current is outside its limit, or the supply reports a trip while live.
+            When voltage or current is outside its limit, or the supply reports a trip while live; and when the
+            monitor is frozen, whoever takes the voltage down.
         """
         self.last = sample
         below = abs(sample.voltage) < SAFE_VOLTAGE  # False for NaN
         self._low_samples = self._low_samples + 1 if below else 0
+        if self.commanded and not below:
+            self._judge_frozen(sample)
         if self.state is not GuardState.LIVE:
             return
         self._limits.measured_voltage.check(sample.voltage, "HV monitor")
@@ -275,6 +282,30 @@ class Guard:
         if faults:
             raise FaultError(f"hv: the supply reports {flag_names(faults)}.")
         self._judge_deviation(sample)
+
+    def _judge_frozen(self, sample: HVSample) -> None:
+        """A monitor that shows the very same for too long, or while the output must be moving, tells nothing any more.
+
+        At rest only where a current is measured as well: a voltage in whole volts may rightly stand still.
+        """
+        ramping = HVFlag.RAMPING in sample.flags and abs(sample.voltage - self.setpoint) > DEVIATION_V
+        first, was_ramping = self._equal_since or (sample, not ramping)
+        same = sample.voltage == first.voltage and (ramping or sample.current == first.current)  # never for NaN
+        if not same or ramping is not was_ramping:
+            self._equal_since, self._equal_samples = (sample, ramping), 1
+            return
+        self._equal_samples += 1
+        if ramping:
+            missing = self._ramp * (sample.t - first.t)
+            frozen = missing > FROZEN_RAMP_V and self._equal_samples >= FROZEN_RAMP_SAMPLES
+        else:
+            frozen = self._equal_samples >= FROZEN_SAMPLES
+        if frozen:
+            self._equal_since = None
+            raise FaultError(
+                f"hv: the monitor has shown the same {sample.voltage:.6g} V for {sample.t - first.t:.2f} s"
+                f"{' of a ramp' if ramping else ''}; it is frozen."
+            )
 
     def _judge_deviation(self, sample: HVSample) -> None:
         """The output must be on, at the set-point that was asked for; two samples in a row that say no are a fault."""

@@ -45,6 +45,10 @@ OnBus = IsegEDCP | CiA404
 Instrument = OnLine | OnBus
 
 
+Unasked = ZaberStage | KeyenceLKG | IsegEDCP | CiA404
+"""Those that can send what nobody asked for."""
+
+
 class _Timed(Protocol):
     """Something that acts by itself."""
 
@@ -239,7 +243,7 @@ class SimulatedBench:
 
     def _switch_device(self, fault: Fault, number: int, begins: bool, t: float) -> None:
         instrument = self.instruments[fault.role]
-        if isinstance(instrument, ZaberStage | KeyenceLKG) and fault.kind == "alert":
+        if isinstance(instrument, Unasked) and fault.kind == "alert":
             if fault.value == 0:
                 instrument.before_reply = self._interleave(instrument, fault, number) if begins else None
             else:
@@ -272,7 +276,7 @@ class SimulatedBench:
             case IsegEDCP() | Shvps():
                 self._switch_supply(instrument, fault, begins, t)
 
-    def _alert(self, instrument: ZaberStage | KeyenceLKG, fault: Fault, begins: bool, t: float) -> None:
+    def _alert(self, instrument: Unasked, fault: Fault, begins: bool, t: float) -> None:
         """Unsolicited lines: one, or one every ``value`` seconds for the duration of the fault."""
         if not begins:
             return
@@ -283,7 +287,7 @@ class SimulatedBench:
             if rest > 0:
                 self.inject(fault.model_copy(update={"at_s": t + period, "duration_s": rest}))
 
-    def _interleave(self, instrument: ZaberStage | KeyenceLKG, fault: Fault, number: int) -> Callable[[float], None]:
+    def _interleave(self, instrument: Unasked, fault: Fault, number: int) -> Callable[[float], None]:
         rng = self._rng(f"fault {number}")
 
         def alert_by_chance(t: float) -> None:

@@ -1,9 +1,10 @@
 """A load cell on CANopen, device profile CiA 404 (analogue input), frame by frame.
 
-Identifiers of node n: SDO request 600h + n, answer 580h + n; TPDO1 180h + n; boot-up and heartbeat 700h + n; network
-management 000h ``command node``. Everything is little-endian. After power-up it sends the boot-up frame and is
-PRE-OPERATIONAL; process data are sent only in OPERATIONAL, by the event timer (1800h:5, in milliseconds). The mapping
-of the process data (1A00h) can be changed while the PDO is switched off (bit 31 of 1800h:1) and its length is zero.
+Identifiers of node n: SDO request 600h + n, answer 580h + n; TPDO1 180h + n; emergency 80h + n; boot-up and heartbeat
+700h + n; network management 000h ``command node``. Everything is little-endian. After power-up it sends the boot-up
+frame and is PRE-OPERATIONAL; process data are sent only in OPERATIONAL, by the event timer (1800h:5, in milliseconds).
+The mapping of the process data (1A00h) can be changed while the PDO is switched off (bit 31 of 1800h:1) and its length
+is zero.
 
 Sources: CiA 301 (SDO, PDO, network management), CiA 404 (objects 61xxh to 91xxh), CiA 303-2 (units), manual of
 Baumer's DSRT strain link (autozero, refused as "time out" when out of the taring range).
@@ -92,6 +93,8 @@ class CiA404:
     ----------
     saturated, status_bits : faults
         Sign of the rail the input is stuck at, 0 for none; these bits are set in the status (6150h).
+    before_reply : callable or None
+        A fault: called with the time before each SDO answer is sent.
     """
 
     def __init__(self, settings: CiA404Truth, world: World, wire: FrameWire, rng: np.random.Generator) -> None:
@@ -101,6 +104,7 @@ class CiA404:
         self._noise = ConversionNoise(rng, 1.0 / settings.conversion_rate_Hz)
         self.saturated = 0
         self.status_bits = 0
+        self.before_reply: Callable[[float], None] | None = None
         self._frozen: float | None = None
         self._tare = [0.0] * settings.inputs  # N
         self._objects = self._dictionary()
@@ -129,6 +133,11 @@ class CiA404:
         self._frozen = None
         if frozen:
             self._frozen = self._newtons(self._settings.channel, t)
+
+    def alert(self, t: float) -> None:
+        """An error appears (CAN overrun) and is gone again: two emergency messages."""
+        for code, register in ((0x8110, 0x11), (0x0000, 0x00)):
+            self._wire.send((0x080 + self._settings.node, struct.pack("<HB5x", code, register)), t)
 
     # What it measures
 
@@ -339,6 +348,8 @@ class CiA404:
         elif identifier == 0x600 + self._settings.node and len(data) == 8 and self._state is not State.STOPPED:
             answer = self._serve(data, t)
             if answer is not None:
+                if self.before_reply is not None:
+                    self.before_reply(t)
                 self._wire.send((0x580 + self._settings.node, answer.ljust(8, b"\0")), t + ANSWER_S)
 
     def _manage(self, command: int, t: float) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,6 +71,8 @@ class IsegEDCP:
     stuck_on, sag, wrong_status, interlock_open, inhibited : faults
         The output ignores every way of switching off; the part of the voltage that is left; bits inverted in the
         channel status; the safety loop is open; the external inhibit is active.
+    before_reply : callable or None
+        A fault: called with the time before each answer is sent.
     """
 
     def __init__(self, settings: HVTruth, world: World, wire: FrameWire, rng: np.random.Generator) -> None:
@@ -84,6 +87,7 @@ class IsegEDCP:
         self.stuck_on = False
         self.sag = 1.0
         self.wrong_status = 0
+        self.before_reply: Callable[[float], None] | None = None
         self._interlock_open = False
         self._inhibited = False
         self._frozen: tuple[float, float] | None = None
@@ -124,6 +128,15 @@ class IsegEDCP:
         self._frozen = None
         if frozen:
             self._frozen = self._measured_v(t), self._measured_i(t)
+
+    def alert(self, t: float) -> None:
+        """Announce itself as a module that nobody has registered."""
+        self._wire.send((self._base | 1, bytes([0xD8, self._module_status() >> 8, MODULE_CLASS])), t)
+
+    def _reply(self, data: bytes, t: float) -> None:
+        if self.before_reply is not None:
+            self.before_reply(t)
+        self._wire.send((self._base, data), t + ANSWER_S)
 
     def open_interlock(self, t: float, is_open: bool) -> None:
         """The safety loop opens (output off at once) or closes."""
@@ -202,8 +215,7 @@ class IsegEDCP:
             self._registered = False
             self._next_logon = self._addressed + QUIET_S
         while not self._registered and self._next_logon <= t:
-            status = self._module_status() >> 8
-            self._wire.send((self._base | 1, bytes([0xD8, status, MODULE_CLASS])), self._next_logon)
+            self.alert(self._next_logon)
             self._next_logon += self._settings.logon_period_s
         tick = math.floor(t / TICK + 1e-9)
         if tick > self._tick:
@@ -360,12 +372,12 @@ class IsegEDCP:
         value = self._module_value(opcode)
         if value is not None:
             head = struct.pack(">H", opcode) + (rest[:1] if opcode == 0x1004 else b"")
-            self._wire.send((self._base, head + value), t + ANSWER_S)
+            self._reply(head + value, t)
 
     def _answer_channel(self, opcode: int, number: int, t: float) -> None:
         value = self._channel_value(opcode, self._channels[number], t)
         if value is not None:
-            self._wire.send((self._base, struct.pack(">HB", opcode, number) + value), t + ANSWER_S)
+            self._reply(struct.pack(">HB", opcode, number) + value, t)
 
     def _module_value(self, opcode: int) -> bytes | None:
         s = self._settings

@@ -5,7 +5,8 @@ Every key has a default, so that ``seed = 1`` is a complete table. Keys carry th
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -17,40 +18,33 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Role = Literal["stage", "force", "displacement", "hv"]
 
 LINK_FAULTS = ("delay", "drop", "split", "merge", "duplicate", "corrupt", "silent", "vanish")
-DEVICE_FAULTS: dict[str, tuple[str, ...]] = {
-    "stage": ("alert", "reset", "freeze", "wrong_status"),
-    "force": ("reset", "saturate", "freeze", "wrong_status"),
-    "displacement": ("alert", "reset", "saturate", "freeze", "no_value", "wrong_status"),
-    "hv": (
-        "reset",
-        "freeze",
-        "wrong_status",
-        "stuck_on",
-        "breakdown",
-        "over_current",
-        "sag",
-        "interlock",
-        "inhibit",
-    ),
-}
-# Which instruments there are to be simulated, where a role has more than one; the first is the default.
-TWINS = {"force": ("gsv8", "cia404"), "hv": ("iseg-edcp", "shvps")}
-# Faults that an instrument cannot have although others of its role can.
-IMPOSSIBLE_FAULTS: dict[str, tuple[str, ...]] = {
-    "iseg-edcp": ("split", "merge"),  # a CAN frame is one piece
-    "cia404": ("split", "merge"),
-    "shvps": ("interlock", "inhibit"),  # it has neither input
-}
+SWITCHES = (*LINK_FAULTS, "alert", "reset", "saturate", "freeze", "wrong_status")
+"""What any instrument can be told to do wrong, where it means anything for it."""
+
+
+class InstrumentTruth(Table):
+    """What every simulated instrument has.
+
+    ``means_nothing`` says of which switches, and why; ``more_faults`` are the instrument's own.
+    """
+
+    means_nothing: ClassVar[Mapping[str, str]] = {}
+    more_faults: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def faults(cls) -> tuple[str, ...]:
+        """Everything that can go wrong with it."""
+        return tuple(kind for kind in SWITCHES if kind not in cls.means_nothing) + cls.more_faults
 
 
 class Fault(Table):
     """Something that goes wrong at a given time.
 
-    ``kind`` is one of the wire's faults (delay, drop, split, merge, duplicate, corrupt, silent, vanish), which act
-    on each message with ``probability``, or one of the instrument's own (`DEVICE_FAULTS`).
+    ``kind`` is one of the wire's faults (`LINK_FAULTS`), which act on each message with ``probability``, or one of the
+    instrument's own (`InstrumentTruth.faults`).
 
-    alert sends unsolicited lines every ``value`` seconds; with ``value = 0`` one between each command and its reply,
-    with ``probability``. Otherwise ``value`` is: seconds for delay and split; amperes drawn beside the film for
+    alert sends what nobody asked for every ``value`` seconds; with ``value = 0`` one between each command and its
+    reply, with ``probability``. Otherwise ``value`` is: seconds for delay and split; amperes drawn beside the film for
     over_current; the part of the voltage that is left for sag; the sign of the rail for saturate; the bit pattern (of
     the shvps: the mode) for wrong_status of force and hv.
     """
@@ -65,10 +59,14 @@ class Fault(Table):
 
     @model_validator(mode="after")
     def _kind_fits_role(self) -> Self:
-        allowed = LINK_FAULTS + DEVICE_FAULTS[self.role]
+        allowed = dict.fromkeys(kind for twin in TWINS[self.role].values() for kind in twin.faults())
         if self.kind not in allowed:
             raise ValueError(f"{self.role} has no fault {self.kind!r}; it has {', '.join(allowed)}")
         return self
+
+
+ONE_PIECE = dict.fromkeys(("split", "merge"), "a CAN frame is one piece")
+IN_REACH = {"saturate": "the monitors reach beyond what it can give"}
 
 
 class MaxwellBranch(Table):
@@ -103,9 +101,12 @@ class LinkTruth(Table):
     baud: Annotated[int, Field(ge=0)] = 115_200
 
 
-class StageTruth(Table):
+class StageTruth(InstrumentTruth):
     """Zaber X-LSQ150B-E01 on ASCII."""
 
+    means_nothing: ClassVar[Mapping[str, str]] = {"saturate": "a position ends at the travel's limits"}
+
+    driver: Literal["zaber"] = "zaber"
     serial_number: int = 50_443
     device_address: Annotated[int, Field(ge=1, le=99)] = 1
     microstep_um: Positive = 0.49609375
@@ -123,7 +124,7 @@ class StageTruth(Table):
     link: LinkTruth = LinkTruth()
 
 
-class LoadCellTruth(Table):
+class LoadCellTruth(InstrumentTruth):
     """What every simulated load cell has."""
 
     full_scale_N: Positive = 0.5
@@ -135,6 +136,8 @@ class LoadCellTruth(Table):
 
 class ForceTruth(LoadCellTruth):
     """Strain-gauge cell on an ME-Messsysteme GSV-8."""
+
+    means_nothing: ClassVar[Mapping[str, str]] = {"alert": "it streams: nothing that it sends was asked for"}
 
     driver: Literal["gsv8"] = "gsv8"
     serial_number: int = 14_209_876
@@ -149,6 +152,8 @@ class ForceTruth(LoadCellTruth):
 
 class CiA404Truth(LoadCellTruth):
     """Load cell on CANopen, device profile CiA 404; it states newtons or millinewtons itself."""
+
+    means_nothing: ClassVar[Mapping[str, str]] = ONE_PIECE
 
     driver: Literal["cia404"]
     serial_number: int = 77_120
@@ -173,9 +178,12 @@ class CiA404Truth(LoadCellTruth):
         return self
 
 
-class DisplacementTruth(Table):
+class DisplacementTruth(InstrumentTruth):
     """Keyence LK-G152 laser triangulation head."""
 
+    more_faults: ClassVar[tuple[str, ...]] = ("no_value",)
+
+    driver: Literal["keyence-lkg"] = "keyence-lkg"
     range_mm: Positive = 40.0
     offset_mm: float = 1.25
     gain_error: float = Field(default=0.0, description="hidden relative error of the scale")
@@ -187,8 +195,10 @@ class DisplacementTruth(Table):
     link: LinkTruth = LinkTruth()
 
 
-class OutputTruth(Table):
+class OutputTruth(InstrumentTruth):
     """What every simulated supply has, and what hangs on its output."""
+
+    more_faults: ClassVar[tuple[str, ...]] = ("stuck_on", "breakdown", "over_current", "sag")
 
     fall_time_s: Positive = Field(default=0.05, description="time in which the output falls to zero when cut")
     gain_error: float = Field(default=0.0, description="hidden relative error of set-point and monitor together")
@@ -200,6 +210,9 @@ class OutputTruth(Table):
 
 class HVTruth(OutputTruth):
     """iseg EDCP module on CAN with one channel."""
+
+    means_nothing: ClassVar[Mapping[str, str]] = ONE_PIECE | IN_REACH
+    more_faults: ClassVar[tuple[str, ...]] = (*OutputTruth.more_faults, "interlock", "inhibit")
 
     driver: Literal["iseg-edcp"] = "iseg-edcp"
     serial_number: int = 484_216
@@ -221,6 +234,8 @@ class HVTruth(OutputTruth):
 class ShvpsTruth(OutputTruth):
     """shvps, the peta-pico-Voltron single-channel supply of dielectric-elastomer labs, on a serial port."""
 
+    means_nothing: ClassVar[Mapping[str, str]] = IN_REACH | {"alert": "it never speaks unasked"}
+
     driver: Literal["shvps"]
     board: Annotated[str, Field(pattern=r"^[ -~]{1,32}$")] = "HVPS 7"
     maximum_voltage_V: Annotated[int, Field(ge=1, le=10_000)] = 5000
@@ -232,6 +247,15 @@ class ShvpsTruth(OutputTruth):
     reboot_s: Positive = 2.0
     power_jack: bool = True
     link: LinkTruth = LinkTruth()
+
+
+# Which instruments there are to be simulated in each role; the first is the default.
+TWINS: dict[str, dict[str, type[InstrumentTruth]]] = {
+    "stage": {"zaber": StageTruth},
+    "force": {"gsv8": ForceTruth, "cia404": CiA404Truth},
+    "displacement": {"keyence-lkg": DisplacementTruth},
+    "hv": {"iseg-edcp": HVTruth, "shvps": ShvpsTruth},
+}
 
 
 def _twin(default: str) -> Discriminator:
@@ -248,8 +272,8 @@ class SimulationSettings(Table):
 
     ``contact_position_mm`` is the stage position at which the pusher meets the flat disk. Force and displacement of
     the disk are zero before; beyond it the stage's way is shared between film and rig,
-    ``stage - contact = displacement + compliance x force``. ``driver`` in the tables ``force`` and ``hv`` says which
-    instrument it is that is simulated; a scene fills it in.
+    ``stage - contact = displacement + compliance x force``. ``driver`` in the instruments' tables says which one it is
+    that is simulated; a scene fills it in.
     """
 
     seed: int
@@ -270,8 +294,10 @@ class SimulationSettings(Table):
 
     def check(self, fault: Fault) -> None:
         """Raise ValueError when the instrument that is simulated in the fault's role cannot have it."""
-        driver: str = {"force": self.force.driver, "hv": self.hv.driver}.get(fault.role, "")
-        impossible = IMPOSSIBLE_FAULTS.get(driver, ())
-        if fault.kind in impossible:
-            allowed = [kind for kind in LINK_FAULTS + DEVICE_FAULTS[fault.role] if kind not in impossible]
-            raise ValueError(f"{fault.role} ({driver}) has no fault {fault.kind!r}; it has {', '.join(allowed)}")
+        truth: StageTruth | AnyForceTruth | DisplacementTruth | AnyHVTruth = getattr(self, fault.role)
+        if fault.kind not in truth.faults():
+            why = truth.means_nothing.get(fault.kind, "")
+            raise ValueError(
+                f"{fault.role} ({truth.driver}) has no fault {fault.kind!r}{f' ({why})' if why else ''}; "
+                f"it has {', '.join(truth.faults())}"
+            )

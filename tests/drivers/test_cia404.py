@@ -387,7 +387,7 @@ def test_silence_is_an_error() -> None:
     rig = Rig().until_ready()
     rig.run(0.3)
     rig.node.running = False
-    with pytest.raises(DeviceSilent, match="no valid process value"):
+    with pytest.raises(DeviceSilent, match="no valid value"):
         rig.run(1.0)
 
 

@@ -431,7 +431,7 @@ def test_silence_is_an_error() -> None:
     rig = Rig().until_ready()
     rig.run(1.0)
     rig.amp.streaming = False
-    with pytest.raises(DeviceSilent, match=r"no valid measured value for 0\.2"):
+    with pytest.raises(DeviceSilent, match=r"no valid value for 0\.2"):
         rig.run(1.0)
 
 

@@ -1,4 +1,4 @@
-"""Load-cell and HV drivers on their simulated instruments, with every fault switch: what must happen.
+"""Load-cell and HV drivers on simulated instruments when things go wrong: more than the matrix of switches says.
 
 The instruments move in virtual time. The film is slack and the load cell's noise is off, so that its true reading is
 one number; the supply is on at 1000 V.
@@ -14,7 +14,7 @@ import pytest
 
 from drivers.gsv8 import GSV8
 from drivers.iseg_edcp import IsegEDCP
-from drivers.link import DeviceError, DeviceLost, DeviceSilent
+from drivers.link import DeviceError, DeviceSilent
 from drivers.roles import ForceSample, HVFlag, HVSample, SampleFlag
 from model.materials import NAMED
 from model.specimen import Specimen
@@ -137,33 +137,6 @@ def test_corrupt_bytes_from_the_load_cell(rig: Rig) -> None:
     assert not rig.errors
 
 
-def test_silent_load_cell_is_told_and_heard_again(rig: Rig) -> None:
-    begin = rig.t
-    rig.inject("force", "silent", duration_s=1.0)
-    rig.run(0.9)
-    assert kinds(rig.errors) == {DeviceSilent}
-    assert rig.errors[0][0] - begin < 0.3
-    rig.run(0.3)
-    rig.errors.clear()
-    rig.forces.clear()
-    rig.run(1.0)
-    assert not rig.errors
-    assert len(rig.forces) == pytest.approx(100, abs=2)
-    assert rig.force.counters["lost_samples"] == pytest.approx(100, abs=2)
-
-
-def test_vanished_load_cell_is_lost_until_the_port_is_back(rig: Rig) -> None:
-    rig.inject("force", "vanish", duration_s=0.5)
-    rig.run(0.4)
-    assert kinds(rig.errors) == {DeviceLost}
-    assert len(rig.errors) < 100
-    rig.run(0.3)
-    rig.errors.clear()
-    rig.forces.clear()
-    rig.run(0.5)
-    assert rig.forces and not rig.errors
-
-
 @pytest.mark.parametrize(("kind", "value"), [("delay", 0.1), ("delay", 0.4), ("drop", None), ("duplicate", None)])
 def test_bad_wire_to_the_load_cell(rig: Rig, kind: str, value: float | None) -> None:
     """The tare gets there; its answer is given to it alone, and the stream is not disturbed."""
@@ -182,15 +155,6 @@ def test_bad_wire_to_the_load_cell(rig: Rig, kind: str, value: float | None) -> 
 # The load cell itself -------------------------------------------------------------------------------------------------
 
 
-def test_load_cell_that_restarts_is_told_before_it_streams_again(rig: Rig) -> None:
-    begin = rig.t
-    rig.inject("force", "reset")
-    rig.run(0.9)
-    assert kinds(rig.errors) == {DeviceSilent}
-    assert rig.errors[0][0] - begin < 0.3
-    assert all(s.t < begin + 0.02 for s in rig.forces)
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_saturated_load_cell_says_so_on_every_sample(rig: Rig, sign: float) -> None:
     rig.inject("force", "saturate", value=sign, duration_s=1.0)
@@ -201,20 +165,6 @@ def test_saturated_load_cell_says_so_on_every_sample(rig: Rig, sign: float) -> N
     rig.forces.clear()
     rig.run(0.3)
     assert not any(s.flags for s in rig.forces[2:])
-
-
-def test_wrong_status_of_the_load_cell_is_passed_on(rig: Rig) -> None:
-    rig.inject("force", "wrong_status", value=2.0)
-    rig.run(0.5)
-    assert {s.flags for s in rig.forces[2:]} == {SampleFlag.SENSOR_ERROR}
-
-
-def test_frozen_load_cell_is_passed_on_as_it_is(rig: Rig) -> None:
-    """The driver cannot know; that a force does not change while the stage moves is for the engine to notice."""
-    rig.inject("force", "freeze")
-    rig.run(1.0)
-    assert len(rig.forces) == pytest.approx(100, abs=2)
-    assert not rig.errors
 
 
 # The supply's bus -----------------------------------------------------------------------------------------------------
@@ -246,31 +196,6 @@ def test_emergency_off_gets_through_a_bus_that_loses_frames_or_is_said_not_to(li
     assert not live.hv.busy
     unconfirmed = any("EMERGENCY OFF IS NOT CONFIRMED" in str(error) for _, error in live.errors)
     assert unconfirmed or float(live.bench.world.voltage(np.array([live.t]))[0]) < 1.0
-
-
-def test_silent_module_is_told_within_a_second_and_asked_again(live: Rig) -> None:
-    begin = live.t
-    live.inject("hv", "silent", duration_s=2.0)
-    live.run(1.9)
-    assert kinds(live.errors) == {DeviceSilent}
-    assert live.errors[0][0] - begin < 0.9
-    live.run(1.0)
-    live.errors.clear()
-    live.outputs.clear()
-    live.run(1.0)
-    assert len(live.outputs) == pytest.approx(10, abs=1) and not live.errors
-
-
-def test_vanished_bus_is_lost_until_it_is_back(live: Rig) -> None:
-    live.inject("hv", "vanish", duration_s=0.5)
-    live.run(0.4)
-    assert kinds(live.errors) == {DeviceLost}
-    assert len(live.errors) < 10
-    live.run(1.5)
-    live.errors.clear()
-    live.outputs.clear()
-    live.run(1.0)
-    assert live.outputs and not live.errors
 
 
 # The module itself ----------------------------------------------------------------------------------------------------
@@ -317,13 +242,6 @@ def test_an_event_stays_latched_until_cleared(live: Rig) -> None:
     assert live.outputs[-1].flags == HVFlag(0)
 
 
-def test_sagging_output_is_measured(live: Rig) -> None:
-    live.inject("hv", "sag", value=0.5)
-    live.run(1.0)
-    assert live.outputs[-1].voltage == pytest.approx(0.5 * VOLTS, abs=5)
-    assert live.outputs[-1].setpoint == VOLTS
-
-
 def test_output_that_cannot_be_switched_off_goes_on_being_measured(live: Rig) -> None:
     """Control and status say off; the voltage that is there says otherwise, and is what the guard looks at."""
     live.inject("hv", "stuck_on")
@@ -332,13 +250,3 @@ def test_output_that_cannot_be_switched_off_goes_on_being_measured(live: Rig) ->
     live.run(0.5)
     assert HVFlag.EMERGENCY_OFF in live.outputs[-1].flags
     assert live.outputs[-1].voltage == pytest.approx(VOLTS, abs=5)
-
-
-def test_frozen_monitor_is_passed_on_as_it_is(live: Rig) -> None:
-    """The driver cannot know; that the voltage does not follow the set-point is for the engine to notice."""
-    live.inject("hv", "freeze")
-    live.hv.set_voltage(200.0)
-    live.run(2.0)
-    assert len({s.voltage for s in live.outputs[1:]}) == 1
-    assert live.outputs[-1].setpoint == 200.0
-    assert not live.errors

@@ -14,7 +14,7 @@ import pytest
 
 from model.membrane import solve_many
 from rig.log.reader import read_log
-from rig.sim.settings import DEVICE_FAULTS, LINK_FAULTS, Fault
+from rig.sim.settings import Fault
 
 Tell = Callable[..., Any]  # of conftest.Story
 
@@ -114,24 +114,3 @@ def test_ends_safe(tell: Tell, role: str, kind: str, more: dict[str, Any]) -> No
     assert abs(story.final_output) < 60 and story.outcome.safe
     assert story.off_after < 2.5
     assert read_log(story.log).outcome["status"] == story.outcome.status  # type: ignore[index]
-
-
-def test_every_switch_has_its_required_behaviour() -> None:
-    listed = {(role, kind) for role, kind, _ in TOLERATED + SAFE}
-    listed |= {
-        # Elsewhere in this folder: a supply that cannot be heard or does not obey is called NOT SAFE.
-        ("hv", "vanish"),
-        ("hv", "silent"),
-        ("hv", "stuck_on"),
-        # These protocols have no checksum: a damaged value that still has its form cannot be told from a good one.
-        ("force", "corrupt"),
-        ("displacement", "corrupt"),
-        ("hv", "corrupt"),
-        ("displacement", "wrong_status"),
-        ("hv", "wrong_status"),
-        ("hv", "freeze"),
-    }
-    for role, kinds in DEVICE_FAULTS.items():
-        kinds_of_wire = [kind for kind in LINK_FAULTS if role != "hv" or kind not in ("split", "merge")]
-        for kind in (*kinds_of_wire, *kinds):
-            assert (role, kind) in listed, f"{role} {kind}: say what is required"

@@ -220,3 +220,55 @@ def test_off_is_believed_only_when_measured_twice() -> None:
     for voltage, safe in [(900.0, False), (30.0, False), (math.nan, False), (30.0, False), (10.0, True), (70.0, False)]:
         guard.on_sample(sample(voltage))
         assert guard.output_is_safe is safe
+
+
+def at(
+    t: float, voltage: float, flags: HVFlag = HVFlag.ON, current: float = 5e-8, setpoint: float = 1000.0
+) -> HVSample:
+    return HVSample(t, voltage, current, setpoint, flags)
+
+
+def test_a_monitor_that_shows_the_very_same_for_too_long_is_frozen() -> None:
+    guard, _, _ = live()
+    for number in range(24):
+        guard.on_sample(at(0.1 * number, 999.5))
+    guard.on_sample(at(2.4, 999.625))  # one that differs, and it counts anew
+    for number in range(25, 48):
+        guard.on_sample(at(0.1 * number, 999.5))
+    for number in range(48, 72):
+        guard.on_sample(at(0.1 * number, 999.5, current=1e-9 * number))  # the current shows that it measures
+    with pytest.raises(FaultError, match=r"same 999\.5 V for 2\.40 s; it is frozen"):
+        for number in range(72, 98):
+            guard.on_sample(at(0.1 * number, 999.5, current=3e-8))
+
+
+def test_a_voltage_in_whole_volts_without_a_current_may_rightly_stand_still() -> None:
+    guard, supply, _ = live()
+    supply.measures_current = False
+    for number in range(200):
+        guard.on_sample(at(0.1 * number, 1000.0, current=math.nan))
+    # ... for long, and then a ramp begins
+    guard.request(100.0, 0.0)
+    guard.on_sample(at(20.0, 1000.0, HVFlag.ON | HVFlag.RAMPING, math.nan, 900.0))
+    guard.on_sample(at(20.1, 1000.0, HVFlag.ON | HVFlag.RAMPING, math.nan, 870.0))
+    guard.on_sample(at(20.2, 930.0, HVFlag.ON | HVFlag.RAMPING, math.nan, 840.0))
+
+
+@pytest.mark.parametrize("orderly", [False, True])
+def test_a_monitor_that_does_not_move_with_the_ramp_is_frozen(orderly: bool) -> None:
+    guard, _, _ = live()
+    guard.on_sample(at(0.0, 1000.0))
+    if orderly:
+        guard.ramp_off("end")  # the latch is SAFE, and the voltage is still there
+    else:
+        guard.request(100.0, 0.0)
+    ramping = HVFlag.ON | HVFlag.RAMPING
+    with pytest.raises(FaultError, match=r"same 1000 V for 0\.\d\d s of a ramp; it is frozen"):
+        for number in range(1, 8):
+            guard.on_sample(at(0.1 * number, 1000.0, ramping, 1e-8 * number))
+
+
+def test_a_ramp_that_moves_however_slowly_is_none_that_is_frozen() -> None:
+    guard, _, _ = live()
+    for number in range(100):
+        guard.on_sample(at(0.1 * number, 500.0 + number // 2, HVFlag.ON | HVFlag.RAMPING))

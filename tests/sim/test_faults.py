@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from rig.sim.settings import DEVICE_FAULTS, LINK_FAULTS, Fault, SimulationSettings
+from rig.sim.settings import SWITCHES, TWINS, Fault, SimulationSettings
 from rig.sim.wire import WireGone
 
 POLL = b"/1 1 07\n"
@@ -358,17 +358,54 @@ def test_faults_of_roles_that_are_not_there_are_left_out_of_a_scene_and_refused_
         host.bench.inject(fault("hv", "silent"))
 
 
-@pytest.mark.parametrize("role", DEVICE_FAULTS)
-def test_every_fault_of_every_role_can_be_switched_on_and_off(make_host, role):
-    host = make_host("stage", "force", "displacement", "hv")
-    kinds = [k for k in (*LINK_FAULTS, *DEVICE_FAULTS[role]) if not (role == "hv" and k in ("split", "merge"))]
-    for kind in kinds:
-        begin = host.t + 0.1
-        host.bench.inject(fault(role, kind, at_s=begin, duration_s=0.2, direction="both"))
-        host.t += 1.6
+PROBE = {
+    "zaber": b"/1 1\n",
+    "keyence-lkg": b"M1\r",
+    "shvps": b"QVer\r",
+    "iseg-edcp": "201#1208",
+    "cia404": "605#4000100000000000",
+    "gsv8": b"",
+}
+TWINS_BY_DRIVER = {driver: (role, twin) for role, twins in TWINS.items() for driver, twin in twins.items()}
+
+
+@pytest.mark.parametrize("driver", TWINS_BY_DRIVER)
+def test_every_fault_of_every_instrument_can_be_switched_on_and_off(make_host, driver):
+    role, twin = TWINS_BY_DRIVER[driver]
+    host = make_host(role, **{role: {"driver": driver}})
+    host.wait(2.5)
+    for kind in twin.faults():
+        host.bench.inject(fault(role, kind, at_s=host.t + 0.1, duration_s=0.2, direction="both"))
+        host.t += 3.0
         host.bench.advance(host.t)
-    answer = host.can("201#1208") if role == "hv" else host.ask(role, b"M1\r" if role == "displacement" else b"/1 1\n")
+    host.wait(0.5)
+    answer = host.can(PROBE[driver], role=role) if isinstance(PROBE[driver], str) else host.ask(role, PROBE[driver])
     assert answer
+
+
+@pytest.mark.parametrize("driver", TWINS_BY_DRIVER)
+def test_every_switch_means_something_for_an_instrument_or_it_says_why_not(make_host, driver):
+    role, twin = TWINS_BY_DRIVER[driver]
+    assert set(twin.means_nothing) <= set(SWITCHES) and not set(twin.means_nothing) & set(twin.more_faults)
+    for kind in SWITCHES:
+        if kind in twin.means_nothing:
+            with pytest.raises(ValueError, match="has no fault") as refused:
+                make_host(role, **{role: {"driver": driver}}, fault=[{"role": role, "kind": kind}])
+            others = [other.faults() for other in TWINS[role].values()]
+            assert twin.means_nothing[kind] in str(refused.value) or not any(kind in own for own in others)
+
+
+@pytest.mark.parametrize(("driver", "message"), [("iseg-edcp", "201#d8"), ("cia404", "085#1081")])
+def test_what_a_node_on_can_says_unasked(make_host, driver, message):
+    role, _ = TWINS_BY_DRIVER[driver]
+    host = make_host(role, **{role: {"driver": driver}})
+    host.wait(0.5)
+    host.can("200#D801", role=role)  # the supply is registered, and quiet
+    host.bench.inject(fault(role, "alert", at_s=host.t, value=0.0, duration_s=1.0))
+    answers = host.can(PROBE[driver], role=role)
+    assert answers[0].startswith(message) and len(answers) > 1
+    host.wait(1.0)
+    assert not host.can(PROBE[driver], role=role)[0].startswith(message)
 
 
 @pytest.mark.parametrize(
