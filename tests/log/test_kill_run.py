@@ -1,0 +1,100 @@
+"""kill -9 in the middle of a whole ``dea-rig run`` over pseudo-terminals: of the engine, of the writer."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.gsv8 import Decoder, Measured
+from rig.benchmark.rates import FORCE_HZ, scene_text
+from rig.log.reader import read_log
+from rig.log.recover import recover
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks processes up in /proc")]
+PROTOCOL = Path(str(files("sim_fixtures"))) / "protocols" / "short.toml"
+
+
+@pytest.fixture
+def run(tmp_path, request):
+    """A run with 800 V on, interrupted at an instant that differs."""
+    scene, ports, log = tmp_path / "scene.toml", tmp_path / "ports.json", tmp_path / "run.mcap"
+    scene.write_text(scene_text())
+    dea_rig = [sys.executable, "-m", "rig"]
+    bench = subprocess.Popen([*dea_rig, "sim", scene], stdout=subprocess.PIPE, text=True)
+    ports.write_text(bench.stdout.readline())
+    arguments = ["run", scene, PROTOCOL, "-o", log, "--ports", ports, "--arm", "--yes"]
+    run = subprocess.Popen([*dea_rig, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        said = [next(run.stderr)]
+        while not ("800 V" in said[-1] and "sweep: 0 to" in said[-1]):
+            said.append(next(run.stderr, None))
+            assert said[-1] is not None, f"the run never got there: {said}"
+        time.sleep(random.Random(request.param).uniform(0.0, 1.0))
+        yield run, log.with_name("run.mcap.part")
+    finally:
+        for process in (run, bench):
+            process.terminate()
+            process.communicate(timeout=30)
+
+
+def writer_of(part):
+    """The process that writes the log."""
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit() and process.name != str(os.getpid()):
+            words = (process / "cmdline").read_bytes().split(b"\0")
+            if b"rig.log.server" in words and str(part)[:-5].encode() in words:
+                return int(process.name)
+    raise AssertionError("nobody writes the log")
+
+
+def check_samples(log):
+    """Every force sample is one that stands in the recorded bytes, in their order, and next to none is missing."""
+    samples = log.columns("/force/sample")
+    decoder, sent = Decoder(), []
+    for data in log.columns("/raw/force/rx")["data"]:
+        sent += [frame.values[0] for frame in decoder.feed(data) if isinstance(frame, Measured)]
+    rest = iter(sent)
+    assert all(reading in rest for reading in samples["reading"])
+    assert log.missing == {}
+    # of the bytes that are there, only those of the last turns may be without their samples
+    assert len(list(rest)) <= 0.3 * FORCE_HZ
+    assert (np.diff(samples["t_s"]) > 0).all()
+
+
+@pytest.mark.parametrize("run", [1, 2], indirect=True)
+def test_kill_of_the_engine(run):
+    engine, part = run
+    writer = writer_of(part)
+    killed_ns = time.time_ns()
+    engine.send_signal(signal.SIGKILL)
+    end = time.monotonic() + 30
+    while Path(f"/proc/{writer}").exists() and "Z" not in Path(f"/proc/{writer}/stat").read_text().rsplit(")")[1]:
+        assert time.monotonic() < end, "the writer lives on without producers"
+        time.sleep(0.05)
+    log = read_log(part)
+    assert log.ended and log.gaps == () and log.outcome is None and "cut" in log.metadata
+    assert log.end_ns > killed_ns - 500_000_000  # the exact bound is tested with an engine that keeps account
+    check_samples(log)
+    assert recover(part, part.with_name("saved.mcap")).exit_code == 3
+
+
+@pytest.mark.parametrize("run", [3], indirect=True)
+def test_kill_of_the_writer(run):
+    engine, part = run
+    killed_ns = time.time_ns()
+    os.kill(writer_of(part), signal.SIGKILL)
+    _, err = engine.communicate(timeout=60)
+    assert engine.returncode == 1, err
+    assert "the process that writes the log has ended" in err and "high voltage off, measured" in err
+    log = read_log(part)
+    assert not log.ended and log.gaps[-1].reason.startswith("the file ends")
+    assert log.end_ns > killed_ns - 500_000_000
+    check_samples(log)
+    assert recover(part, part.with_name("saved.mcap")).exit_code == 3
