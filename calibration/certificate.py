@@ -12,9 +12,11 @@ A certificate is a small TOML file, kept beside the scenes that use it and attac
     gain_relative_uncertainty = 1e-3     # standard uncertainty (k = 1), as are all others
     noise_N = 5e-3                       # standard deviation of one sample
     zero_uncertainty_N = 2e-4            # of a zero taken before the run, drift until its end included
+    zero_reading_mV_per_V = 0.013        # optional: the unloaded sensor when it was calibrated, its stored zero
     range_N = [-1.0, 1.0]                # calibrated range; no extrapolation
 
-A force sensor that states newtons itself has ``gain_N_per_N`` instead. The keys of a displacement certificate end in
+A force sensor that states newtons itself has ``gain_N_per_N`` and ``zero_reading_N`` instead. The keys of a
+displacement certificate end in
 ``_m`` with ``gain_m_per_m``, those of an HV certificate in ``_V`` with ``gain_V_per_V``.
 """
 
@@ -55,6 +57,9 @@ class Certificate:
         Relative standard uncertainty of the gain.
     noise, zero_uncertainty : float
         Standard deviation of one sample; standard uncertainty of a zero (N, m, V).
+    stored_zero : float or None
+        Reading of the unloaded force sensor when it was calibrated, with which the sensor's serial number and the date
+        stand in this file: the force limit holds against it, whatever zero a run takes.
     low, high : float
         Ends of the calibrated range (N, m, V).
     name : str
@@ -73,6 +78,7 @@ class Certificate:
     gain_uncertainty: float
     noise: float
     zero_uncertainty: float
+    stored_zero: float | None
     low: float
     high: float
     name: str
@@ -164,7 +170,16 @@ class _File(BaseModel):
         return self
 
     def _certificate(
-        self, role: Role, gain: float, unit: str, noise: float, zero: float, ends: list[float], name: str, raw: bytes
+        self,
+        role: Role,
+        gain: float,
+        unit: str,
+        noise: float,
+        zero: float,
+        ends: list[float],
+        name: str,
+        raw: bytes,
+        stored_zero: float | None = None,
     ) -> Certificate:
         low, high = ends
         if not low < high:
@@ -180,6 +195,7 @@ class _File(BaseModel):
             gain_uncertainty=self.gain_relative_uncertainty,
             noise=noise,
             zero_uncertainty=zero,
+            stored_zero=stored_zero,
             low=low,
             high=high,
             name=name,
@@ -191,6 +207,8 @@ class _ForceFile(_File):
     role: Literal["force"]
     gain_N_per_mV_per_V: Positive | None = None
     gain_N_per_N: Positive | None = None
+    zero_reading_mV_per_V: float | None = None
+    zero_reading_N: float | None = None
     noise_N: Positive
     zero_uncertainty_N: NotNegative
     range_N: Range
@@ -199,12 +217,17 @@ class _ForceFile(_File):
     def _one_gain(self) -> _ForceFile:
         if (self.gain_N_per_mV_per_V is None) == (self.gain_N_per_N is None):
             raise ValueError("give either gain_N_per_mV_per_V or gain_N_per_N, as the sensor's readings are")
+        if (self.zero_reading_N if self.gain_N_per_N is None else self.zero_reading_mV_per_V) is not None:
+            raise ValueError("the stored zero must be in the unit of the sensor's readings, as the gain is")
         return self
 
     def certificate(self, name: str, raw: bytes) -> Certificate:
         gain, unit = (self.gain_N_per_mV_per_V, "mV/V") if self.gain_N_per_N is None else (self.gain_N_per_N, "N")
         assert gain is not None  # _one_gain
-        return self._certificate("force", gain, unit, self.noise_N, self.zero_uncertainty_N, self.range_N, name, raw)
+        zero = self.zero_reading_mV_per_V if unit == "mV/V" else self.zero_reading_N
+        return self._certificate(
+            "force", gain, unit, self.noise_N, self.zero_uncertainty_N, self.range_N, name, raw, zero
+        )
 
 
 class _DisplacementFile(_File):

@@ -450,6 +450,11 @@ class IsegEDCP:
         return self._nominal
 
     @property
+    def fastest_ramp(self) -> float:
+        """V/s, of the nominal voltage; NaN until that is known."""
+        return self._max_ramp / 100 * self._nominal[0]
+
+    @property
     def busy(self) -> bool:
         return self._commands > 0
 

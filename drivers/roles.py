@@ -182,6 +182,11 @@ class HVSupply(Device, Protocol):
         ...
 
     @property
+    def fastest_ramp(self) -> float:
+        """The fastest ramp it takes (V/s)."""
+        ...
+
+    @property
     def busy(self) -> bool:
         """True while a command is waiting to be sent or verified."""
         ...

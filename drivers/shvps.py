@@ -144,6 +144,11 @@ class Shvps:
         return self._max_volts, math.nan
 
     @property
+    def fastest_ramp(self) -> float:
+        """Any: the ramp is made here, in steps."""
+        return math.inf
+
+    @property
     def busy(self) -> bool:
         return self._commands > 0
 

@@ -72,6 +72,7 @@ def _patience(action: Action) -> float:
 def _home(engine: Engine, action: Action) -> Turns:
     stage = engine.bench.stage
     engine.command("stage", "home", "")
+    engine.recorder.speed = 0.0  # the device's own, not known here
     stage.home()
     yield from _wait(engine, lambda: not stage.moving, HOMING_LIMIT_S, "The end of the stage's homing")
     if not stage.referenced:
@@ -93,8 +94,10 @@ def _zero(engine: Engine, action: Action) -> Turns:
     with _listening(engine, listen):
         yield from _pause(engine, action.parameters["duration"])
     zero, error = _mean(force, "force")
-    check_zero(engine.limits, engine.gains.force * zero)
+    check_zero(engine.limits, recorder.from_stored_zero(zero))
     recorder.force_zero = zero
+    engine.learn("force", force)
+    engine.learn("displacement", laser)
     engine.force_noise = error * math.sqrt(len(force)) * engine.gains.force
     recorder.reference("force_zero", recorder.force_zero, error, engine.bench.force.reading_unit)
     if recorder.has_laser:

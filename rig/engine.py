@@ -14,19 +14,19 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from drivers.link import DeviceError
+from drivers.link import DeviceError, DeviceSilent
 from drivers.roles import HVSample, Sample
 from rig.actions import Turns, carry_out, choose_about_live_output, confirm_voltage, rest
 from rig.bench import Bench
 from rig.control import Control, Question
-from rig.errors import ConfigError, FaultError, LimitError, RigError, Stopped
+from rig.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.host import HostTime
 from rig.plan import Action
 from rig.recorder import Gains, Recorder, Severity
 from rig.safety import heartbeat
 from rig.safety.arming import Arming
 from rig.safety.guard import AnyGuard, Guard, GuardState
-from rig.safety.limits import FilmLimits, Limits
+from rig.safety.limits import FilmLimits, Limit, Limits
 from rig.teardown import Rest, Teardown
 from rig.watch import Watch, allowed_silence
 
@@ -81,6 +81,12 @@ class Outcome:
             "stage_position_mm": f"{self.position * 1e3:.4f}",
             "duration_s": f"{self.duration:.3f}",
         }
+
+
+def _lets_ramp_down(error: Exception) -> bool:
+    """Whether a run that ended so may ramp its voltage down; otherwise the output is taken off at once."""
+    silent = isinstance(error, DeviceSilent) and not error.device.startswith("hv")
+    return silent or isinstance(error, Stopped | StaleData)
 
 
 class Engine:
@@ -153,6 +159,7 @@ class Engine:
     def move_stage(self, position: float, speed: float) -> None:
         """Move the stage to ``position`` metres of its own scale."""
         self.limits.speed.check(speed, "Stage speed")
+        self.recorder.speed = speed
         self.command("stage", "move_to", f"{float(position)!r} m at {speed!r} m/s")
         self.bench.stage.move_to(position, speed)
 
@@ -185,6 +192,11 @@ class Engine:
     def event(self, source: str, message: str) -> None:
         """Write to the log what a reader of it should know."""
         self.recorder.event("info", source, message)
+
+    def learn(self, role: str, readings: Sequence[float]) -> None:
+        """Let the watch learn the noise of an unloaded sensor."""
+        if self._watch is not None and readings:
+            self._watch.learn(role, readings)
 
     def ask(self, question: Question) -> Generator[None, None, str]:
         """Ask the operator and yield until he has answered; question and answer go into the log.
@@ -228,7 +240,7 @@ class Engine:
             if self._doing:
                 error.add_note(f"It happened during {self._doing}.")
         rest = Teardown(self.bench, self.guard, self.recorder, self.control).run(
-            reason, status in ("complete", "stopped"), self._next_turn
+            reason, error is None or _lets_ramp_down(error), self._next_turn
         )
         for role, device in self.bench.devices.items():
             counted = ", ".join(f"{key}={value}" for key, value in sorted(device.counters.items()) if value)
@@ -277,7 +289,20 @@ class Engine:
                 f"force: the certificate is for readings in {self.gains.force_unit}, but the instrument gives them in "
                 f"{unit}. Use the instrument's own certificate. Nothing was moved and no output changed."
             )
+        self._check_devices()
         self._check_output()
+
+    def _check_devices(self) -> None:
+        """What the plan needs and these devices cannot do is refused while nothing has moved."""
+        if self.guard is not None and self.highest_voltage > 0:
+            self.guard.check_supply(self.highest_voltage)
+        start = self.bench.scene.stage.approach_from_mm * 1e-3
+        if any(action.kind == "approach" for action in self._actions):
+            travel = Limit("stage position", *self.bench.stage.travel, "mm", 1e3)
+            travel.check(start, "stage.approach_from_mm, for this stage")
+            ends = [end for action in self._actions for end in action.h]
+            travel.check(start + min(ends), "Clearance of the return step, where the film can be met first")
+            travel.check(start + max(ends), "Largest displacement, where the film can be met first")
 
     def _check_identity(self, role: str) -> None:
         table, device = self.bench.scene.instruments[role], self.bench.devices[role]

@@ -31,6 +31,10 @@ class FaultError(RigError):
     exit_code = 4
 
 
+class StaleData(FaultError):
+    """A sensor is silent, frozen or gives no values: the run ends, and the voltage is ramped down."""
+
+
 class Stopped(RigError):
     """The operator ended the run."""
 

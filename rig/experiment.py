@@ -190,7 +190,7 @@ def gains_of(certificates: dict[str, Certificate]) -> Gains:
     """Quantity per reading of each sensor, by the certificates."""
     gain = {role: certificate.gain for role, certificate in certificates.items()}
     force = certificates["force"]  # every scene names it
-    return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit)
+    return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit, force.stored_zero)
 
 
 def _log(out: Path, scene: Scene) -> LogWriter | LogProcess:

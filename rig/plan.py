@@ -6,16 +6,17 @@ anything moves, and what the engine then carries out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from model.membrane import Status, solve_many
+from model.membrane import Status, solve, solve_many
 from model.specimen import Specimen
 from rig import protocol as steps
 from rig.errors import LimitError
-from rig.safety.limits import Limits
+from rig.safety.limits import Limits, capacitance
 from rig.scene import Scene
 
 HOMING_S = 20.0  # only for the estimate: a long-travel stage at its homing speed
@@ -60,6 +61,7 @@ class Prediction:
     peak_force: float
     peak_field: float
     minimum_hoop_stress: float
+    stored_energy: float
     status: Status
 
 
@@ -196,7 +198,7 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
             h, contact = 0.0, False
 
 
-def predict(action: Action, specimen: Specimen) -> Prediction:
+def predict(action: Action, specimen: Specimen, parallel_capacitance: float = 0.0) -> Prediction:
     """What the model expects during ``action``: extremes over its displacements at both of its voltages."""
     h = np.linspace(max(action.h[0], 0.0), max(action.h[1], 0.0), POINTS if action.moves else 1)
     voltage = np.array(sorted(set(action.voltage)))[:, None]
@@ -205,8 +207,17 @@ def predict(action: Action, specimen: Specimen) -> Prediction:
         peak_force=float(np.max(states.force)),
         peak_field=float(np.max(states.peak_field)),
         minimum_hoop_stress=float(np.min(states.min_hoop_stress)),
+        stored_energy=_stored_energy(specimen, float(h.max()), max(action.voltage), parallel_capacitance),
         status=Status(int(np.max(states.status))),
     )
+
+
+def _stored_energy(specimen: Specimen, h: float, voltage: float, beside: float) -> float:
+    """0.5 C V^2 (J) where the film is stretched the most; NaN where the model has no state."""
+    if voltage == 0.0:
+        return 0.0
+    state = solve(specimen, h, voltage)
+    return 0.5 * (capacitance(state) + beside) * voltage**2 if state.answered else math.nan
 
 
 def check_plan(actions: list[Action], scene: Scene) -> list[Prediction]:
@@ -227,9 +238,11 @@ def check_plan(actions: list[Action], scene: Scene) -> list[Prediction]:
         limits.speed.check(action.speed, where)
         for level in action.voltage:
             limits.voltage.check(level, where)
+            if scene.hv is not None and scene.hv.whole_volts and level != round(level):
+                raise LimitError(f"{where}: the {scene.hv.driver} supply takes whole volts only.")
         path = (frozenset(action.h), frozenset(action.voltage), action.moves)
         if path not in known:
-            known[path] = predict(action, specimen)
+            known[path] = predict(action, specimen, limits.parallel_capacitance)
         prediction = known[path]
         no_taut_state = f"{where}: the model has no taut state there. {prediction.status.message}"
         if prediction.status not in (Status.TAUT, Status.WRINKLED):
@@ -237,6 +250,7 @@ def check_plan(actions: list[Action], scene: Scene) -> list[Prediction]:
         limits.force.check(prediction.peak_force, f"{where}, predicted")
         limits.field.check(prediction.peak_field, f"{where}, predicted")
         limits.hoop_stress.check(prediction.minimum_hoop_stress, f"{where}, predicted")
+        limits.energy.check(prediction.stored_energy, f"{where}, predicted")
         if prediction.status is Status.WRINKLED:
             raise LimitError(no_taut_state)
         predictions.append(prediction)

@@ -31,6 +31,7 @@ class Gains:
     displacement: float = 1.0
     voltage: float = 1.0
     force_unit: str = "mV/V"  # of the force sensor's readings, as its certificate has it
+    stored_zero: float | None = None  # reading of the unloaded force sensor, as stored with its serial number and date
 
 
 class Recorder:
@@ -50,6 +51,7 @@ class Recorder:
         self.force_zero = math.nan
         self.displacement_zero = math.nan
         self.contact = math.nan
+        self.speed = 0.0  # of the stage, as last asked for
         self.has_laser = has_laser
         self.log_failed = False
         self._told_of_space = False
@@ -75,9 +77,14 @@ class Recorder:
             return self._gains.force * (sample.reading - self.force_zero)
         return self._gains.displacement * (sample.displacement - self.displacement_zero)
 
-    def unzeroed(self, sample: ForceSample) -> float:
-        """Newtons of one sample by certificate alone, its zero not taken off."""
-        return self._gains.force * sample.reading
+    def from_stored_zero(self, reading: float) -> float:
+        """Newtons of one reading against the stored zero, whatever zero the run has taken; 0 where none is stored."""
+        return self._gains.force * (reading - (self._gains.stored_zero or 0.0))
+
+    @property
+    def has_stored_zero(self) -> bool:
+        """Whether a zero of the force sensor is stored."""
+        return self._gains.stored_zero is not None
 
     def add(self, sample: Sample) -> Sample:
         """Take in one sample, write it, and give it back; a measured voltage comes back by its certificate."""

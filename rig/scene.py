@@ -103,6 +103,8 @@ class LimitsTable(Table):
     current_uA: Positive | None = None
     field_V_per_um: Positive | None = None
     minimum_hoop_stress_kPa: float = 0.0
+    stored_energy_mJ: Positive = 350.0  # 0.5 C V^2; EN 50191 names this as the harmless discharge
+    leakage_uA: Positive = 2.0  # beside the current that charges the film; more in two samples running is a breakdown
 
 
 class SerialTable(Table):
@@ -158,9 +160,11 @@ class ShvpsTable(SerialTable):
     """The shvps supply of dielectric-elastomer labs on a serial port. Whole volts; it does not measure its current."""
 
     measures_current: ClassVar[bool] = False
+    whole_volts: ClassVar[bool] = True
     driver: Literal["shvps"]
     baud: int = Field(default=115200, gt=0)
     ramp_V_per_s: Positive = 100.0
+    parallel_capacitance_nF: NotNegative = 0.0  # of cable and output, beside the film
     poll_rate_Hz: float = Field(default=10.0, gt=0, le=20)
 
 
@@ -207,10 +211,12 @@ class IsegTable(CanTable):
     """One channel of an iseg supply that speaks EDCP on CAN."""
 
     measures_current: ClassVar[bool] = True
+    whole_volts: ClassVar[bool] = False
     driver: Literal["iseg-edcp"]
     module: int = Field(default=0, ge=0, le=63)
     channel: int = Field(default=0, ge=0, le=23)
     ramp_V_per_s: Positive = 100.0
+    parallel_capacitance_nF: NotNegative = 0.0  # of cable and output, beside the film
     max_ramp_percent_per_s: float = Field(default=20.0, gt=0, le=100)  # of nominal; what the module takes at most
     poll_rate_Hz: float = Field(default=10.0, gt=0, le=50)
 

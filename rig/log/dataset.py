@@ -235,7 +235,7 @@ def _without_interrupted(phases: list[Phase]) -> list[Phase]:
     followers = [*(phase.kind for phase in phases[1:]), ""]
     return [
         phase._replace(record=False) if follower == "pause" else phase
-        for phase, follower in zip(phases, followers, strict=True)
+        for phase, follower in zip(phases, followers, strict=False)
     ]
 
 

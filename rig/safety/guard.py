@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from drivers.roles import HVFlag, HVSample, HVSupply
 from rig.errors import FaultError, LimitError
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
-from rig.safety.limits import FilmLimits, Limits
+from rig.safety.limits import FilmLimits, Limit, Limits
 
 if TYPE_CHECKING:
     from rig.safety.remote import RemoteGuard
@@ -31,6 +31,7 @@ FROZEN_RAMP_V, FROZEN_RAMP_SAMPLES = 100.0, 3  # nor does a ramp over so much le
 FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
 AT_ONCE_S = 5.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
 ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
+CHARGING_PART = 0.2  # what the model may be wrong in the film's charging current
 SAFE_SAMPLES = 2  # consecutive measured voltages below SAFE_VOLTAGE before we call the output safe
 
 TRIP = HVFlag.TRIPPED | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.INTERLOCK_OPEN | HVFlag.ARC | HVFlag.FAULT
@@ -90,6 +91,8 @@ class Guard:
         self._equal_samples = 0
         self._equal_since: tuple[HVSample, bool] | None = None  # and whether the output was to move
         self._seen_on = False
+        self._charge: tuple[float, float] | None = None  # time (s) and charge on the film (C) at the last sample
+        self._leaking_samples = 0
         self.last: HVSample | None = None
 
     @property
@@ -128,6 +131,24 @@ class Guard:
         self.cause = ""
         self._alive_at = None
         self._seen_on = False
+        self._charge = None
+
+    def check_supply(self, highest: float) -> None:
+        """Refuse what this supply cannot be asked for, before anything moves.
+
+        Raises
+        ------
+        LimitError
+            When its ramp, its current limit or ``highest``, the highest voltage planned, is beyond what it can do.
+        """
+        volts, amperes = self._supply.nominal
+        Limit("voltage", 0.0, volts, "V").check(highest, "hv: the protocol's highest voltage, for this supply")
+        fastest = Limit("ramp", 0.0, self._supply.fastest_ramp, "V/s")
+        fastest.check(self._ramp, "hv.ramp_V_per_s, for this supply")
+        if self._supply.measures_current:
+            Limit("current", 0.0, amperes, "uA", 1e6).check(
+                self._limits.current.high, "limits.current_uA, for this supply"
+            )
 
     def check_off(self) -> None:
         """The output must have been measured off, and the channel say that it is.
@@ -278,6 +299,7 @@ class Guard:
         self._limits.measured_voltage.check(sample.voltage, "HV monitor")
         if self._supply.measures_current:
             self._limits.current.check(sample.current, "HV monitor")
+            self._judge_current(sample)
         faults = sample.flags & TRIP
         if faults:
             raise FaultError(f"hv: the supply reports {flag_names(faults)}.")
@@ -305,6 +327,27 @@ class Guard:
             raise FaultError(
                 f"hv: the monitor has shown the same {sample.voltage:.6g} V for {sample.t - first.t:.2f} s"
                 f"{' of a ramp' if ramping else ''}; it is frozen."
+            )
+
+    def _judge_current(self, sample: HVSample) -> None:
+        r"""More current than charges the film and may leak, in two samples running, is a breakdown.
+
+        A film takes :math:`i = d(CV)/dt + V/R`: here the model's charge on the deformed film, differenced from sample
+        to sample, and the limit ``leakage_uA``. While it discharges the supply may show no current at all.
+        """
+        h = self._beat.displacement if self._beat is not None else math.nan
+        volts = max(sample.voltage, 0.0)
+        charge = volts * self._film.capacitance(h if math.isfinite(h) else 0.0, volts)
+        last, self._charge = self._charge, (sample.t, charge)
+        if last is None or not sample.t > last[0]:
+            return
+        charging = max((charge - last[1]) / (sample.t - last[0]), 0.0)
+        allowed = charging * (1 + CHARGING_PART) + self._limits.leakage
+        self._leaking_samples = 0 if sample.current <= allowed else self._leaking_samples + 1
+        if self._leaking_samples >= DEVIATION_SAMPLES:
+            raise FaultError(
+                f"hv: breakdown, the film draws {sample.current * 1e6:.3g} uA where charging and leakage explain at "
+                f"most {allowed * 1e6:.3g} uA."
             )
 
     def _judge_deviation(self, sample: HVSample) -> None:

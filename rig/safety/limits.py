@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from model.membrane import Status, solve
+import numpy as np
+
+from model.membrane import Solution, Status, solve
 from model.specimen import Specimen
 from rig.errors import LimitError
 from rig.scene import Scene
@@ -69,6 +71,9 @@ class Limits:
     current: Limit
     field: Limit
     hoop_stress: Limit
+    energy: Limit
+    leakage: float  # A beside the charging current
+    parallel_capacitance: float  # F beside the film
 
     @classmethod
     def of(cls, scene: Scene) -> Limits:
@@ -93,7 +98,23 @@ class Limits:
             current=Limit("current", -current, current, "uA", 1e6),
             field=Limit("field", 0.0, min(candidates, default=math.inf), "V/um", 1e-6),
             hoop_stress=Limit("hoop stress", table.minimum_hoop_stress_kPa * 1e3, math.inf, "kPa", 1e-3),
+            energy=Limit("stored energy", 0.0, table.stored_energy_mJ * 1e-3, "mJ", 1e3),
+            leakage=table.leakage_uA * 1e-6,
+            parallel_capacitance=scene.hv.parallel_capacitance_nF * 1e-9 if scene.hv is not None else 0.0,
         )
+
+
+def capacitance(state: Solution) -> float:
+    r"""Capacitance of the deformed film (F) between electrodes that cover it.
+
+    The film keeps its volume: where its area has grown by :math:`\lambda_1\lambda_2` it is thinner by as much, so that
+
+    .. math:: C = \varepsilon \int \frac{dA}{t}
+              = \frac{\varepsilon}{T \lambda_p^2} \int_a^b 2 \pi R (\lambda_1 \lambda_2)^2 dR
+    """
+    s, p = state.specimen, state.profile()
+    integrand = 2 * np.pi * p.R * (p.stretch_1 * p.stretch_2) ** 2
+    return float(np.trapezoid(integrand, p.R)) * s.material.permittivity / (s.thickness * s.prestretch**2)
 
 
 class FilmLimits:
@@ -108,7 +129,7 @@ class FilmLimits:
         self._limits = limits
 
     def check(self, h: float, voltage: float, where: str) -> None:
-        """Raise unless the film at ``h`` metres and ``voltage`` volts is taut and below its field limit.
+        """Raise unless the film at ``h`` metres and ``voltage`` volts is taut, below its field and its energy limit.
 
         Raises
         ------
@@ -120,6 +141,24 @@ class FilmLimits:
         self._limits.hoop_stress.check(state.min_hoop_stress, where)
         if state.status is not Status.TAUT:
             raise LimitError(f"{where}: the model has no taut state there ({state.status.message}).")
+        self._limits.energy.check(self._energy(state), where)
+
+    def _energy(self, state: Solution) -> float:
+        """0.5 C V^2 of film and cable (J).
+
+        Where an upper bound suffices, that bound: nowhere does the film have more than its peak field, and its volume
+        does not change.
+        """
+        s, v2 = self._specimen, state.voltage**2
+        beside = 0.5 * self._limits.parallel_capacitance * v2
+        volume = s.thickness * math.pi * (s.ring_radius**2 - s.disk_radius**2) / s.prestretch**2
+        bound = 0.5 * s.material.permittivity * state.peak_field**2 * volume + beside
+        return bound if self._limits.energy.holds(bound) or v2 == 0.0 else 0.5 * capacitance(state) * v2 + beside
+
+    def capacitance(self, h: float, voltage: float) -> float:
+        """Capacitance of film and cable (F) at displacement ``h`` metres; NaN where the model has no state."""
+        state = solve(self._specimen, max(h, 0.0), voltage)
+        return capacitance(state) + self._limits.parallel_capacitance if state.answered else math.nan
 
     def check_path(self, h0: float, h1: float, voltage: float, points: int = 5) -> None:
         """Check the film along a move from ``h0`` to ``h1`` metres at ``voltage`` volts, ends included.

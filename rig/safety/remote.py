@@ -200,6 +200,9 @@ class RemoteGuard:
         self.commanded = True  # should the answer never come
         self._call("arm")
 
+    def check_supply(self, highest: float) -> None:
+        self._call("check_supply", highest)
+
     def check_off(self) -> None:
         self._call("check_off")
 
