@@ -24,6 +24,7 @@ NEWTON_FACTOR = 0.3
 RUNG_FACTOR = 0.5
 ROUND_OFF = 1e-13
 FOLDED = -1e-2  # of the meridional stress: a hoop stress below it will not turn out positive on a finer rung
+FLAT = -1e-9  # of the meridional stress: a hoop stress between it and zero is round-off
 LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two rungs may agree by chance
 
 

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model import ritz, single, tension_field, trace
-from model.ladder import Answer, Start, climb, first_modes
+from model.ladder import FLAT, Answer, Start, climb, first_modes
 from model.law import Array, Evaluations, Film, stack, stress
 from model.profile import Profile, profile
 from model.ritz import LONGEST, Grid, Problem, State
+from model.single_parts import Film as OneFilm
+from model.single_parts import Found, slack
 from model.specimen import Specimen
 
 Wrinkling = Literal["plain", "tension_field"]
@@ -25,7 +27,6 @@ BLOCK = 1024  # states solved together: their arrays stay in the processor's cac
 SOFTENING = 0.35
 TRACE_MODES = 10
 WIDEST = 28.0  # ln(b/a) beyond which the film's R^2 has no place in double precision
-FLAT = -1e-9  # of the meridional stress: a hoop stress between it and zero is round-off
 
 
 class Status(IntEnum):
@@ -131,7 +132,7 @@ class Solution:
     dforce: dict[str, Any] | None = None
     evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
     kept: tuple[Problem, Grid, State, Array] | None = field(default=None, repr=False, compare=False)
-    quick: single.Found | None = field(default=None, repr=False, compare=False)
+    quick: Found | None = field(default=None, repr=False, compare=False)
 
     @property
     def answered(self) -> bool:
@@ -154,8 +155,7 @@ class Solution:
         if self.quick is not None:
             inputs = _Inputs.gather(self.specimen, self.h, self.voltage)
             problem = _Block(inputs, np.zeros(1, dtype=np.intp), self.evaluations).problem
-            state = State(np.array(self.quick.c)[:, None], np.array(self.quick.w)[:, None, None])
-            kept = problem, Grid.lay(self.quick.modes, problem.cut()), state, np.array([self.quick.lam])
+            kept = problem, *self.quick.arrays(), np.array([self.quick.lam])
         if kept is None:
             raise ValueError(f"no profile: {self.status.message}")
         s = self.specimen
@@ -254,14 +254,14 @@ def _check(tolerance: float, wrinkling: str) -> None:
 
 
 def _quick(
-    specimen: Specimen, h: float, voltage: float, tolerance: float, near: single.Found | None
+    specimen: Specimen, h: float, voltage: float, tolerance: float, folds: bool, near: Found | None
 ) -> Solution | None:
     """An easy state, solved without arrays; None when it is not one."""
     m, t, b, lp = specimen.material, specimen.thickness, specimen.ring_radius, specimen.prestretch
     if h == 0.0 or not (math.isfinite(h) and math.isfinite(voltage)) or tolerance < 1e-11:
         return None
     shear = m.shear_modulus
-    film = single.Film(
+    film = OneFilm(
         terms=tuple((mu / shear, alpha, mu / shear * alpha) for mu, alpha in zip(m.mu, m.alpha, strict=True)),
         field=m.permittivity * (voltage / t) ** 2 / shear,
         log_prestretch=math.log(lp),
@@ -269,12 +269,13 @@ def _quick(
         height=abs(h) / b,
     )
     count = Evaluations()
-    found = None if near is None else single.solve(film, tolerance, count, near)
+    found = None if near is None else single.solve(film, tolerance, count, folds=folds, near=near)
     if found is None:
-        found = single.solve(film, tolerance, count)
+        found = single.solve(film, tolerance, count, folds=folds)
     if found is None or found.softening > SOFTENING or found.meridional <= 0.0:
         return None
-    if found.hoop < FLAT * found.meridional:  # slack must be ruled out, and folds may be asked for
+    wrinkled = bool(found.cones) or found.hoop < FLAT * found.meridional
+    if wrinkled and slack(film):
         return None
     force = 2.0 * math.pi * b * t * shear / lp**2 * found.lam
     peak, stretch = abs(voltage) / t * math.exp(found.log_area), math.exp(found.log_stretch)
@@ -288,7 +289,7 @@ def _quick(
         min_hoop_stress=shear * found.hoop,
         min_meridional_stress=shear * found.meridional,
         max_stretch=stretch,
-        status=Status.TAUT,
+        status=Status.WRINKLED if wrinkled else Status.TAUT,
         error_estimate=found.error,
         iterations=found.steps,
         modes=found.modes,
@@ -329,7 +330,8 @@ def solve(
     """
     _check(tolerance, wrinkling)
     if not sensitivities:
-        quick = _quick(specimen, float(h), float(voltage), tolerance, near.quick if near else None)
+        folds = wrinkling == "tension_field"
+        quick = _quick(specimen, float(h), float(voltage), tolerance, folds, near.quick if near else None)
         if quick is not None:
             return quick
     many, kept = _solve(_Inputs.gather(specimen, float(h), float(voltage)), tolerance, wrinkling, sensitivities)

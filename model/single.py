@@ -1,156 +1,191 @@
-"""One taut state in plain Python numbers, for loops that ask for one state at a time.
+"""One state in plain Python numbers, for loops that ask for one state at a time.
 
-Arrays of ten numbers cost more to hand to NumPy than to compute with, so the very steps of `model.ritz` and
-`model.ladder`, restricted to one element and one state, are written out here once more; a test holds both to each
-other's digits. Whatever is not an ordinary taut or mildly wrinkled state is left to them.
+Arrays of ten numbers cost more to hand to NumPy than to compute with, so the very steps of `model.ritz`, `model.cone`,
+`model.tension_field` and `model.ladder`, restricted to one state, are written out here once more; a test holds both to
+each other's digits. Whatever is not an ordinary state is left to them.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from itertools import pairwise
 from math import exp, expm1, log1p
 
 import numpy as np
 
-from model import ladder, output, ritz
+from model import cone, ladder, ritz, tension_field
 from model.law import Array, Evaluations
+from model.single_output import found
+from model.single_parts import Cone, Film, Floats, Found, Panel, Stray, places, stress, tables_of
 
-Floats = list[float]
 MOST_MODES = 12
 MOST_STEPS = 8
-
-
-@dataclass(frozen=True, slots=True)
-class Film:
-    """One state, dimensionless."""
-
-    terms: tuple[tuple[float, float, float], ...]  # mu/G, alpha, their product
-    field: float  # eps (V/T)^2 / G
-    log_prestretch: float
-    span: float
-    height: float
+WILD = 20.0
 
 
 @dataclass(slots=True)
-class Found:
-    """The state, and what `model.output.Extremes` has."""
+class _System:
+    """Newton's system, `model.ritz.Reduced`; of the matrix the lower triangle."""
 
-    modes: int
-    c: Floats
-    w: Floats
-    lam: float
-    error: float
-    steps: int
-    log_area: float
-    radius: float
-    hoop: float
-    meridional: float
-    log_stretch: float
-    softening: float
+    rows: list[Floats]
+    residual: Floats
+    coupling: Floats
+    give: float = 0.0
+    reach: float = 0.0
 
-
-@dataclass(frozen=True, slots=True)
-class _Lists:
-    """A table of `model.ritz` as lists."""
-
-    points: int
-    below: Floats  # (1 - xi)/2
-    weight: Floats
-    values: Array  # (2Q, N)
-    project: Array  # (N, 2Q)
-    pairs: Array  # (N(N+1)/2, 3Q)
-    ends: Array  # (2, Q)
-    tests: tuple[Floats, Floats, Floats, Floats]
-    fine: Array
+    def add(self, place: list[int], sums: Floats, cut: bool) -> None:
+        """Add an element's matrix, its lower triangle in one row, coupling, residual; without a ``cut`` it is all."""
+        size = len(place)
+        pairs = size * (size + 1) // 2
+        if not cut:
+            self.rows = [sums[i * (i + 1) // 2 : (i + 1) * (i + 2) // 2] for i in range(size)]
+            self.coupling, self.residual = sums[pairs : pairs + size], sums[pairs + size :]
+            return
+        at = 0
+        for i, row in enumerate(place):
+            if row >= 0:
+                self.coupling[row] += sums[pairs + i]
+                self.residual[row] += sums[pairs + size + i]
+            for column in place[: i + 1]:
+                if row >= column >= 0:
+                    self.rows[row][column] += sums[at]
+                elif column > row >= 0:
+                    self.rows[column][row] += sums[at]
+                at += 1
 
 
-@lru_cache(maxsize=32)
-def _lists(modes: int) -> _Lists:
-    t = ritz.table(modes)
-    (disk, disk_slope), (ring, ring_slope) = output.edge_tests(modes)
-    return _Lists(
-        points=t.points,
-        below=(0.5 * (1.0 - t.xi)).tolist(),
-        weight=t.weight.tolist(),
-        values=np.ascontiguousarray(t.values[:, :modes]),
-        project=np.ascontiguousarray(t.project[:modes]),
-        pairs=np.ascontiguousarray(t.pairs[: modes * (modes + 1) // 2]),
-        ends=t.ends,
-        tests=(disk.tolist(), disk_slope.tolist(), ring.tolist(), ring_slope.tolist()),
-        fine=output.fine_table(modes),
-    )
+@dataclass(slots=True)
+class _Strip:
+    """A linearised panel: what its slopes follow with, and how its hoop stress turns when there are cuts."""
+
+    kept: list[tuple[float, float, float, float]]
+    turns: list[tuple[float, float, float]]
 
 
-def _stress(film: Film, log1: float, log2: float) -> tuple[float, float, float, float, float, float]:
-    """t1, t2, h11, h12, h22 and the Maxwell stress; see `model.law`."""
-    log3 = -(log1 + log2)
-    t1 = t2 = 0.0
-    h11 = h22 = 4.0  # sum mu alpha = 2 in units of G
-    h12 = 2.0
-    for mu, alpha, product in film.terms:
-        x, y, z = expm1(alpha * log1), expm1(alpha * log2), expm1(alpha * log3)
-        t1 += mu * (x - z)
-        t2 += mu * (y - z)
-        h11 += product * (x + z)
-        h22 += product * (y + z)
-        h12 += product * z
-    if film.field == 0.0:
-        return t1, t2, h11, h12, h22, 0.0
-    b = film.field * exp(-2.0 * log3)
-    return t1 - b, t2 - b, h11 - 2.0 * b, h12 - 2.0 * b, h22 - 2.0 * b, b
+@dataclass(slots=True)
+class _Spring:
+    """A linearised cone, see `model.cone.Springs`."""
+
+    at: list[tuple[float, float, float, float, float]]  # at points: S1, du/dS1, l1/lp, change of width, its rate
+    miss: float
+    soft: float
+    skew: float
+    share: float
 
 
-class _Solver:
+class Solver:
     """Newton at one resolution after the other."""
 
     def __init__(self, film: Film, count: Evaluations) -> None:
         self.film = film
         self.count = count
+        self.breaks = [-film.span, 0.0]
+        self.c: Floats = []
+        self.panels: list[Panel] = []
+        self.cones: list[Cone] = []
 
-    def lay(self, modes: int) -> None:
-        self.modes, self.lists = modes, _lists(modes)
-        half = 0.5 * self.film.span
-        self.dxi = 1.0 / half
-        self.radius = [exp(-self.film.span * depth) for depth in self.lists.below]
-        self.once = [r * weight * half for r, weight in zip(self.radius, self.lists.weight, strict=True)]
+    def use(self, modes: int) -> None:
+        """Tables of so many modes."""
+        self.modes, self.tables = modes, tables_of(modes, len(self.breaks) > 2)
 
-    def guess(self) -> tuple[Floats, Floats]:
-        """`model.ritz.guess`."""
+    def lay(self) -> None:
+        """Radii and weights of the elements between the breaks."""
+        tables = self.tables
+        parts: list[Panel | Cone] = [*self.panels, *self.cones]
+        for part in parts:
+            left, right = self.breaks[part.number], self.breaks[part.number + 1]
+            length = right - left
+            half = 0.5 * length
+            part.radius = [exp(right - length * depth) for depth in tables.below]
+            part.once = [r * weight * half for r, weight in zip(part.radius, tables.weight, strict=True)]
+            if isinstance(part, Panel):
+                part.dxi = 1.0 / half
+            else:
+                part.ends = (-exp(left), exp(right))
+
+    def strains(self, panel: Panel, c: Floats) -> Floats:
+        """Sum of the panel's functions at the points, and its derivative in xi."""
+        local = [c[i] if i >= 0 else 0.0 for i in panel.place] if self.cones else c
+        values: Floats = (self.tables.values @ local).tolist()
+        return values
+
+    def begin(self, modes: int, near: Found | None) -> None:
+        """The plain state to begin with: `model.ritz.guess`, or ``near`` with its slopes raised to the height."""
+        self.use(modes)
+        panel = Panel(0, [], places(modes, 1, (0,))[0])
+        self.panels = [panel]
+        self.lay()
         film = self.film
-        mean = film.height / -expm1(-film.span)
-        square = mean * mean
-        t1, _, h11, _, _, _ = _stress(film, film.log_prestretch + 0.5 * log1p(square), film.log_prestretch)
-        part = square / (1.0 + square)
-        power = 1.0 - 2.0 * part + part * h11 / t1 if t1 > 0.0 else 1.0
-        rate = film.span / (power if power > 0.5 else 1.0)
-        w = [exp(rate * depth) for depth in self.lists.below]
-        scale = film.height / sum(o * x for o, x in zip(self.once, w, strict=True))
-        return [0.0] * self.modes, [scale * x for x in w]
+        if near is None:
+            mean = film.height / -expm1(-film.span)
+            square = mean * mean
+            t1, _, h11, _, _, _ = stress(film, film.log_prestretch + 0.5 * log1p(square), film.log_prestretch)
+            part = square / (1.0 + square)
+            power = 1.0 - 2.0 * part + part * h11 / t1 if t1 > 0.0 else 1.0
+            rate = film.span / (power if power > 0.5 else 1.0)
+            self.c = [0.0] * modes
+            panel.strain = [0.0] * (2 * self.tables.points)
+            w = [exp(rate * depth) for depth in self.tables.below]
+        else:
+            self.c = near.c[:modes] + [0.0] * (modes - near.modes)
+            panel.strain = self.strains(panel, self.c)
+            w = (ritz.transfer(near.modes, modes) @ near.panels[0].w).tolist()
+        scale = film.height / sum(o * x for o, x in zip(panel.once, w, strict=True))
+        panel.w = [scale * x for x in w]
 
-    def carried(self, near: Found) -> tuple[Floats, Floats]:
-        """Another state of such a film, its slopes raised to the height of this one."""
-        c = near.c[: self.modes] + [0.0] * (self.modes - near.modes)
-        w = (ritz.transfer(near.modes, self.modes) @ near.w).tolist()
-        scale = self.film.height / sum(o * x for o, x in zip(self.once, w, strict=True))
-        return c, [scale * x for x in w]
+    def step(self, goal: float) -> tuple[float, float, float]:
+        """A Newton step: force, largest relative change, tail; as in `model.ritz` and `model.tension_field`."""
+        film, modes, c = self.film, self.modes, self.c
+        cut = bool(self.cones)
+        n = len(c) if cut else 0  # without cuts the only element brings its own
+        system = _System([[0.0] * (i + 1) for i in range(n)], [0.0] * n, [0.0] * n)
+        self.stable, self.rest, self.top = True, 1.0, -math.inf
+        strips = [self.strip(panel, system) for panel in self.panels]
+        springs = [self.spring(fold, system) for fold in self.cones] if cut else []
+        lam0 = (film.height - system.reach) / system.give
+        dc, diagonal, positive = _eliminate(system, lam0)
+        self.stable = self.stable and positive
+        lam = lam0 + sum(x * y for x, y in zip(system.coupling, dc, strict=True)) / system.give
+        self.c = [x + y for x, y in zip(c, dc, strict=True)]
+        largest = stretched = tail = 0.0
+        extent = 1e-300
+        for panel, strip in zip(self.panels, strips, strict=True):
+            change, dq, reach = self.follow(panel, strip, dc, lam)
+            if not change <= largest:
+                largest = change
+            if cut:
+                stretched, extent = max(stretched, dq), max(extent, reach)
+            last, fore = panel.place[modes - 1], panel.place[modes - 2]
+            tail += self.c[last] ** 2 * diagonal[last] + 0.1 * self.c[fore] ** 2 * diagonal[fore]
+        largest *= math.sqrt(self.rest)
+        if cut:
+            bent = max(self.bend(fold, spring, dc, lam) for fold, spring in zip(self.cones, springs, strict=True))
+            largest = max(largest, stretched / extent, bent)
+            breaks, shift = self.moved()
+            largest = max(largest, tension_field.CUT_WEIGHT * shift)
+            if largest > goal:
+                self.breaks = breaks
+                self.lay()
+        return lam, largest, 0.5 * tail / (lam * film.height)
 
-    def step(self, c: Floats, w: Floats) -> tuple[Floats, Floats, float, float, bool, float]:
-        """State after a Newton step, force, largest change of a slope, stability, tail; as in `model.ritz`."""
-        film, lists, dxi = self.film, self.lists, self.dxi
-        points, modes = lists.points, self.modes
+    def strip(self, panel: Panel, system: _System) -> _Strip:
+        """Add a taut element to ``system``; its strains, and what its slopes follow with."""
+        film, tables, dxi, cut = self.film, self.tables, panel.dxi, bool(self.cones)
+        points = tables.points
         lnlp, terms, field = film.log_prestretch, film.terms, film.field
-        strain = (lists.values @ c).tolist()
+        strain = panel.strain
         self.count.mechanical += points
         if field != 0.0:
             self.count.electric += points
-        products = [0.0] * (3 * points)
-        vectors = [0.0] * (4 * points)
-        give = miss = rest = 0.0
+        p2, p3, p4, p5, p6 = 2 * points, 3 * points, 4 * points, 5 * points, 6 * points
+        sums = [0.0] * (7 * points)
+        give = reach = rest = 0.0
+        top = self.top
         kept = []
-        stable = True
-        for i, (slope, once, radius) in enumerate(zip(w, self.once, self.radius, strict=True)):
+        turns = []
+        tension = []
+        for i, (slope, once, radius) in enumerate(zip(panel.w, panel.once, panel.radius, strict=True)):
             e = strain[i]
             q = e + strain[points + i] * dxi
             g = q * (q + 2.0) + slope * slope
@@ -177,12 +212,15 @@ class _Solver:
                 h11 -= b
                 h12 -= b
                 h22 -= b
+            tension.append(t2)
+            if t1 > top:
+                top = t1
             along, down, around = (1.0 + q) / metric, slope / metric, 1.0 / (1.0 + e)
             tm = t1 / metric
             d = h11 - 2.0 * t1
             kww = d * down * down + tm
             if kww <= 0.0:
-                stable = False
+                self.stable = False
             hw = 1.0 / kww
             kqw = d * down * along
             h12a = h12 * around
@@ -192,139 +230,269 @@ class _Solver:
             thw = tm * hw
             qq = twice * (d / metric + tm) * thw
             eq = twice * h12a * along * thw
-            mixed = (qq + eq) * dxi
-            products[i] = twice * ((h22 - t2) * around * around - kew * kew * hw) + eq + eq + qq
-            products[points + i] = mixed
-            products[2 * points + i] = qq * dxi * dxi
+            sums[i] = twice * ((h22 - t2) * around * around - kew * kew * hw) + eq + eq + qq
+            sums[points + i] = (qq + eq) * dxi
+            sums[p2 + i] = qq * dxi * dxi
             hg = hw * gw
             on_q = once * hw * kqw
-            vectors[2 * i] = once * hw * kew + on_q
-            vectors[2 * (points + i)] = on_q * dxi
+            sums[p3 + i] = once * hw * kew + on_q
+            sums[p4 + i] = on_q * dxi
             on_q = twice * (t1 * along - hg * kqw)
-            vectors[2 * i + 1] = twice * (t2 * around - hg * kew) + on_q
-            vectors[2 * (points + i) + 1] = on_q * dxi
+            sums[p5 + i] = twice * (t2 * around - hg * kew) + on_q
+            sums[p6 + i] = on_q * dxi
             give += once * hw / radius
-            miss += once * (hg - slope)
+            reach += once * (slope - hg)
             kept.append((hw, gw, kqw, kew))
-        lam0 = (film.height + miss) / give
-        packed = (lists.pairs @ products).tolist()
-        pairs = (lists.project @ np.array(vectors).reshape(-1, 2)).tolist()
-        dc, diagonal, positive = _eliminate(packed, pairs, give, lam0, modes)
-        lam = lam0 + sum(pair[0] * x for pair, x in zip(pairs, dc, strict=True)) / give
-        change_of = (lists.values @ dc).tolist()
-        largest = 0.0
-        new = []
-        for i, (hw, gw, kqw, kew) in enumerate(kept):
+            if cut:
+                turns.append((h12 * along, h12 * down, h22 * around))
+        panel.tension = tension
+        self.top = top
+        self.rest = max(self.rest, rest)
+        system.give += give
+        system.reach += reach
+        system.add(panel.place, (tables.assemble @ sums).tolist(), cut)
+        return _Strip(kept, turns)
+
+    def follow(self, panel: Panel, strip: _Strip, dc: Floats, lam: float) -> tuple[float, float, float]:
+        """The slopes after the step: largest relative change of them, largest change of dr/dR, size of the strains."""
+        points, dxi = self.tables.points, panel.dxi
+        change_of = self.strains(panel, dc)
+        largest = stretched = extent = 0.0
+        old, new = panel.w, []
+        for i, (hw, gw, kqw, kew) in enumerate(strip.kept):
             de = change_of[i]
-            dw = hw * (lam / self.radius[i] - gw - kqw * (de + change_of[points + i] * dxi) - kew * de)
-            change = abs(dw / w[i])
+            w = old[i]
+            dw = hw * (lam / panel.radius[i] - gw - kqw * (de + change_of[points + i] * dxi) - kew * de)
+            change = abs(dw / w)
             if not change <= largest:
                 largest = change
-            new.append(w[i] + dw)
-        largest *= math.sqrt(max(1.0, rest))
-        moved = [x + dx for x, dx in zip(c, dc, strict=True)]
-        tail = moved[-1] ** 2 * diagonal[-1] + 0.1 * moved[-2] ** 2 * diagonal[-2]
-        return moved, new, lam, largest, stable and positive, 0.5 * tail / (lam * film.height)
+            new.append(w + dw)
+        panel.w = new
+        if min(new) <= 0.0:
+            raise Stray
+        for i, (on_q, on_w, on_e) in enumerate(strip.turns):
+            de = change_of[i]
+            dq = de + change_of[points + i] * dxi
+            stretched = max(stretched, abs(dq))
+            extent = max(extent, abs(panel.strain[i] + panel.strain[points + i] * dxi) + old[i] ** 2)
+            panel.tension[i] += on_q * dq + on_w * (new[i] - old[i]) + on_e * de
+        panel.strain = [x + dx for x, dx in zip(panel.strain, change_of, strict=True)]
+        return largest, stretched, extent
 
-    def refine(self, c: Floats, w: Floats, modes: int) -> tuple[Floats, Floats]:
-        """The same state with more modes."""
-        carried = (ritz.transfer(self.modes, modes) @ w).tolist()
-        padded = c + [0.0] * (modes - self.modes)
-        self.lay(modes)
-        return padded, carried
-
-    def found(self, c: Floats, w: Floats, lam: float, error: float, steps: int) -> Found | None:
-        """Extremes of the state, as in `model.output`."""
-        film, lists, dxi = self.film, self.lists, self.dxi
-        points = lists.points
-        strain = (lists.values @ c).tolist()
-        self.count.mechanical += points
+    def spring(self, fold: Cone, system: _System) -> _Spring:
+        """Add a wrinkled element to ``system``: `model.cone.Springs.of` and `join`."""
+        film = self.film
+        self.count.mechanical += self.tables.points
+        self.count.relaxed += self.tables.points
         if film.field != 0.0:
-            self.count.electric += points
-        columns: tuple[Floats, ...] = ([], [], [], [], [])
-        areas, hoops, meridionals, logs1, logs2 = columns
-        disk, disk_slope, ring, ring_slope = lists.tests
-        at_disk = at_ring = softening = 0.0
-        for i in range(points):
-            e = strain[i]
-            q = e + strain[points + i] * dxi
-            g = q * (q + 2.0) + w[i] * w[i]
-            log1 = 0.5 * log1p(g) + film.log_prestretch
-            log2 = log1p(e) + film.log_prestretch
-            t1, t2, h11, _, _, b = _stress(film, log1, log2)
-            twice = self.once[i] * self.radius[i]
-            on_q = twice * t1 * (1.0 + q) / (1.0 + g)
-            both = twice * t2 / (1.0 + e) + on_q
-            at_disk += disk[i] * both + disk_slope[i] * on_q * dxi
-            at_ring += ring[i] * both + ring_slope[i] * on_q * dxi
-            softening = max(softening, 2.0 * b / (h11 + 2.0 * b))
-            areas.append(log1 + log2)
-            hoops.append(-t2)
-            meridionals.append(-t1)
-            logs1.append(log1)
-            logs2.append(log2)
-        inner = exp(-film.span)
-        pulls = (math.hypot(at_disk, lam * inner) / (inner * inner), math.hypot(at_ring, lam))
-        starts = (lists.ends @ logs1).tolist()
-        edges = [self.edge(pull, start) for pull, start in zip(pulls, starts, strict=True)]
-        if None in edges:
-            return None
-        best, where = [], 0.0
-        for kind, column in enumerate(columns):
-            ends = [edge[kind] for edge in edges if edge is not None]
-            top = max(ends)
-            place = 0.0 if ends[0] >= ends[1] else 1.0
-            if max(column) > top:
-                inside, share = _peak(lists.fine, column)
-                if inside > top:
-                    top, place = inside, share
-            if kind == 0:
-                where = exp(-film.span * (1.0 - place))
-            best.append(top)
-        return Found(self.modes, c, w, lam, error, steps, best[0], where, -best[1], -best[2], max(best[3:]), softening)
+            self.count.electric += self.tables.points
+        share = 1.0
+        at = []
+        for u, natural in zip(fold.u, fold.natural, strict=True):
+            t1, t2, h11, h12, h22, b = stress(film, u + film.log_prestretch, natural)
+            share = max(share, abs(b / t1))
+            follow, change = -h12 / h22, -t2 / h22
+            t1 += h12 * change
+            h11 += h12 * follow
+            stretch = exp(u)
+            if h22 <= 0.0 or h11 <= t1:
+                raise Stray
+            at.append((t1 / stretch, stretch / (h11 - t1), stretch, change, follow))
+        if math.isnan(fold.pull):
+            weighted = sum(o * r * x[0] for o, r, x in zip(fold.once, fold.radius, at, strict=True))
+            fold.pull = weighted / sum(fold.once)
+        excess = axial = 0.0
+        for u, once, radius, (s1, rate, stretch, _, _) in zip(fold.u, fold.once, fold.radius, at, strict=True):
+            excess += once * (expm1(u) + stretch * rate * (fold.pull / radius - s1))
+            axial += once / radius * stretch * rate
+        cos, sin, pull = fold.cos, fold.sin, fold.pull
+        length = fold.ends[0] + fold.ends[1]
+        across = (length + excess) / pull
+        soft = axial * cos * cos + across * sin * sin
+        skew = (axial - across) * cos * sin
+        give = axial * across / soft
+        own = [(place, end) for place, end in zip(fold.cut, fold.ends, strict=True) if place >= 0]
+        miss = sum(end * self.c[place] for place, end in own)
+        miss -= excess * cos - length * sin * sin / (1.0 + cos)
+        if not soft > 0.0:
+            raise Stray
+        ratio = skew / soft
+        force = pull * cos + miss / soft + ratio * pull * sin
+        for place, end in own:
+            system.residual[place] += end * force
+            system.coupling[place] -= end * ratio
+            for beside, other in own:
+                if beside <= place:
+                    system.rows[place][beside] += end * other / soft
+        system.reach += across * pull * sin + ratio * miss - give * pull * sin
+        system.give += give
+        return _Spring(at, miss, soft, skew, share)
 
-    def edge(self, pull: float, start: float) -> tuple[float, float, float, float, float] | None:
-        """The five kinds of values at a clamped edge, from the nominal stress there."""
-        lnlp = self.film.log_prestretch
-        log1 = start
-        for _ in range(3):
-            t1, _, h11, _, _, _ = _stress(self.film, log1, lnlp)
-            factor = exp(lnlp - log1)
-            step = (pull - t1 * factor) / ((h11 - t1) * factor)
-            log1 += step
-            if abs(step) < 1e-7:  # the next one would be its square
-                break
-        if not abs(log1 - start) < 0.1 + 0.5 * abs(start - lnlp):
-            return None
-        t1, t2, _, _, _, _ = _stress(self.film, log1, lnlp)
-        return log1 + lnlp, -t2, -t1, log1, lnlp
+    def bend(self, fold: Cone, spring: _Spring, dc: Floats, lam: float) -> float:
+        """A wrinkled element after the step, and its largest relative change: `model.cone.Springs.advance`."""
+        moved = sum(end * dc[place] for place, end in zip(fold.cut, fold.ends, strict=True) if place >= 0)
+        before = fold.pull * fold.sin
+        h = fold.pull * fold.cos + (spring.miss + moved - spring.skew * (lam - before)) / spring.soft
+        pull = math.hypot(h, lam)
+        size = max(abs(expm1(u)) for u in fold.u) + fold.sin**2
+        largest = 0.0
+        for i, (s1, rate, _, change, follow) in enumerate(spring.at):
+            du = rate * (pull / fold.radius[i] - s1)
+            wider = change + follow * du
+            largest = max(largest, abs(du), abs(wider))
+            fold.u[i] += min(max(du, -0.5), 0.5)
+            fold.natural[i] += min(max(wider, -0.5), 0.5)
+        fold.cos, fold.sin, fold.pull = h / pull, lam / pull, pull
+        return cone.CURVED * max(largest / size, abs(lam / before - 1.0)) * math.sqrt(spring.share)
+
+    def moved(self) -> tuple[Floats, float]:
+        """Breaks moved to where the panels' hoop tension vanishes: `model.tension_field.moved`."""
+        breaks = list(self.breaks)
+        length = [right - left for left, right in pairwise(self.breaks)]
+        folded = {fold.number for fold in self.cones}
+        ends, end_slopes = self.tables.ends.tolist(), self.tables.end_slopes.tolist()
+        largest = 0.0
+        for panel in self.panels:
+            number = panel.number
+            for end, side in ((0, 1), (1, -1)):
+                beside = number - side
+                if beside not in folded:
+                    continue
+                value = _dot(ends[end], panel.tension)
+                slope = _dot(end_slopes[end], panel.tension) * panel.dxi * side
+                shift = -value / slope * side if slope > 0.0 else math.copysign(0.2 * length[number], -value * side)
+                cut = max(number, beside)
+                shift = min(max(shift, -0.5 * length[cut - 1]), 0.5 * length[cut])
+                breaks[cut] += shift
+                largest = max(largest, abs(shift) / min(length[number], length[beside]))
+        for cut in range(1, len(breaks) - 1):
+            breaks[cut] = min(max(breaks[cut], self.breaks[cut - 1]), self.breaks[cut + 1])
+        return breaks, largest
+
+    def fold(self, tolerance: float) -> int:
+        """Cut the film, so far one panel, where its hoop tension changes sign; the modes to go on with."""
+        film, panel, t = self.film, self.panels[0], ritz.table(self.modes)
+        values = (self.tables.fine @ panel.tension).tolist()
+        last = len(values) - 1
+        breaks = [-film.span]
+        for k, (low, high) in enumerate(pairwise(values)):
+            if (low < 0.0) != (high < 0.0):
+                part = min(max(low / (low - high), 0.05), 0.95)
+                share = [0.5 * (1.0 - math.cos((k + i) * math.pi / last)) for i in (0, 1)]
+                breaks.append(film.span * (share[0] + part * (share[1] - share[0]) - 1.0))
+        first = values[0] < 0.0
+        elements = len(breaks)
+        breaks.append(0.0)
+        if elements > tension_field.MOST_ZONES or (elements == 1 and not first):
+            raise Stray
+        modes = max(3, ladder.first_modes(max(right - left for left, right in pairwise(breaks)), tolerance))
+        if modes > MOST_MODES:
+            raise Stray
+        strain = np.array(panel.strain)
+        e, rise = strain[: t.points], strain[t.points :] * panel.dxi
+        new = ritz.table(modes)
+        x = [left + 0.5 * (right - left) * (new.xi + 1.0) for left, right in pairwise(breaks)]
+        to_new = ritz.barycentric(t.xi, 2.0 * (np.concatenate((*x, breaks[1:-1])) / film.span + 1.0) - 1.0)
+        carried = to_new @ np.array((e, rise, panel.w)).T
+        taut = tuple(range(int(first), elements, 2))
+        of_panels = places(modes, elements, taut)
+        self.c, self.panels, self.cones, self.breaks = [], [], [], breaks
+        self.use(modes)
+        for number in range(elements):
+            e, slope, w = carried[number * new.points : (number + 1) * new.points].T
+            if number in taut:
+                half = 0.5 * (breaks[number + 1] - breaks[number])
+                self.c += (new.to_modes @ slope * half).tolist()
+                self.panels.append(Panel(number, w.tolist(), of_panels[len(self.panels)]))
+            else:
+                cut = [len(taut) * modes + k - 1 if 0 < k < elements else -1 for k in (number, number + 1)]
+                self.cones.append(self.cone(number, e, slope, w, np.exp(x[number]) * new.weight, (cut[0], cut[1])))
+        self.c += carried[elements * new.points :, 0].tolist()
+        self.lay()
+        for panel in self.panels:
+            panel.strain = self.strains(panel, self.c)
+        return modes
+
+    def cone(self, number: int, e: Array, slope: Array, w: Array, once: Array, cut: tuple[int, int]) -> Cone:
+        """A wrinkled element made of a state of the plain equations."""
+        film = self.film
+        q = e + slope
+        across, down = float(once @ (1.0 + q)), float(once @ w)
+        long = math.hypot(across, down)
+        u = (0.5 * np.log1p(q * (q + 2.0) + w * w)).tolist()
+        widths = []
+        for log1, log2 in zip(u, (np.log1p(e) + film.log_prestretch).tolist(), strict=True):
+            for _ in range(8):
+                _, t2, _, _, h22, _ = stress(film, log1 + film.log_prestretch, log2)
+                self.count.mechanical += 1
+                self.count.relaxed += 1
+                if film.field != 0.0:
+                    self.count.electric += 1
+                if h22 <= 0.0:
+                    raise Stray
+                change = -t2 / h22
+                log2 += min(max(change, -0.3), 0.3)
+                if abs(change) <= cone.NEAR:
+                    break
+            widths.append(log2)
+        return Cone(number, u, widths, across / long, down / long, math.nan, cut)
+
+    def refine(self, modes: int) -> None:
+        """The same state with more modes."""
+        carry = ritz.transfer(self.modes, modes)
+        taut = tuple(panel.number for panel in self.panels)
+        of_panels = places(modes, len(self.breaks) - 1, taut)
+        c: Floats = []
+        for panel, place in zip(self.panels, of_panels, strict=True):
+            c += [self.c[i] for i in panel.place[: self.modes]] + [0.0] * (modes - self.modes)
+            panel.place = place
+            panel.w = (carry @ panel.w).tolist()
+        added = len(c) - len(taut) * self.modes
+        c += self.c[len(taut) * self.modes :]
+        for fold in self.cones:
+            fold.u, fold.natural = (carry @ fold.u).tolist(), (carry @ fold.natural).tolist()
+            left, right = (place + added if place >= 0 else -1 for place in fold.cut)
+            fold.cut = (left, right)
+        self.c = c
+        self.use(modes)
+        self.lay()
+        for panel in self.panels:
+            panel.strain = self.strains(panel, c)
+
+    def admissible(self, tolerance: float) -> bool:
+        """Whether the zones of the state are those that it was solved with; see `model.tension_field.zones`."""
+        t, fine = ritz.table(self.modes), self.tables.fine
+        margins = [(-1.0, (fine @ panel.tension).tolist()) for panel in self.panels]
+        for fold in self.cones:
+            stretch = [expm1(u) for u in fold.u]
+            versine = fold.sin * fold.sin / (1.0 + fold.cos)
+            rise = [(x * fold.cos - versine) * r for x, r in zip(stretch, fold.radius, strict=True)]
+            half = 0.5 * (self.breaks[fold.number + 1] - self.breaks[fold.number])
+            left = -fold.ends[0] * self.c[fold.cut[0]] if fold.cut[0] >= 0 else 0.0
+            run = (t.integrate @ rise).tolist()
+            hoop = [log1p((left + half * x) / r) for x, r in zip(run, fold.radius, strict=True)]
+            lnlp = self.film.log_prestretch
+            excess = [x + lnlp - natural for x, natural in zip(hoop, fold.natural, strict=True)]
+            margins.append((1.0, (fine @ excess).tolist()))
+        bound = tension_field.SLACK * math.sqrt(tolerance) * max(abs(x) for _, values in margins for x in values)
+        short = min(right - left for left, right in pairwise(self.breaks)) <= 1e-9 * self.film.span
+        return not short and all(sign * x < bound for sign, values in margins for x in values)
 
 
-def _peak(fine: Array, column: Floats) -> tuple[float, float]:
-    """Largest value between the points and its share of the way from the disk (in ln R); see `model.output`."""
-    values = (fine @ column).tolist()
-    last = len(values) - 1
-    top = max(range(last + 1), key=values.__getitem__)
-    place = min(max(top, 1), last - 1)
-    low, mid, high = values[place - 1 : place + 2]
-    curve = low - 2.0 * mid + high
-    shift = min(max(0.5 * (low - high) / curve, -1.0), 1.0) if curve < 0.0 else 0.0
-    peak = max(values[top], mid - 0.25 * (low - high) * shift)
-    return peak, 0.5 * (1.0 - math.cos((place + shift) * math.pi / last))
+def _dot(row: Floats, values: Floats) -> float:
+    return sum(x * y for x, y in zip(row, values, strict=True))
 
 
-def _eliminate(
-    packed: Floats, pairs: list[Floats], give: float, lam0: float, modes: int
-) -> tuple[Floats, Floats, bool]:
-    """Solve the reduced system; also its diagonal and whether it is positive definite."""
-    rows = []
-    at = 0
-    for i in range(modes):
-        share = pairs[i][0] / give
-        rows.append([packed[at + j] + share * pairs[j][0] for j in range(i + 1)])
-        at += i + 1
+def _eliminate(system: _System, lam0: float) -> tuple[Floats, Floats, bool]:
+    """Solve the system; also its diagonal and whether it is positive definite."""
+    rows, coupling = system.rows, system.coupling
+    n = len(rows)
+    for i, row in enumerate(rows):
+        share = coupling[i] / system.give
+        for j in range(i + 1):
+            row[j] += share * coupling[j]
     diagonal = [row[-1] for row in rows]
-    right = [-(pair[1] + lam0 * pair[0]) for pair in pairs]
+    right = [-(x + lam0 * y) for x, y in zip(system.residual, coupling, strict=True)]
     positive = True
     # L D L^T in place: below the diagonal L, on it D.
     for i, row in enumerate(rows):
@@ -345,47 +513,64 @@ def _eliminate(
         row[i] = total
         for j in range(i):
             right[i] -= row[j] * right[j]
-    for i in range(modes - 1, -1, -1):
+    for i in range(n - 1, -1, -1):
         total = right[i] / rows[i][i]
-        for k in range(i + 1, modes):
+        for k in range(i + 1, n):
             total -= rows[k][i] * right[k]
         right[i] = total
     return right, diagonal, positive
 
 
-def solve(film: Film, tolerance: float, count: Evaluations, near: Found | None = None) -> Found | None:
-    """The state to ``tolerance``, or None when it is not an easy one; ``near`` is a state to begin from."""
+def solve(
+    film: Film, tolerance: float, count: Evaluations, *, folds: bool = False, near: Found | None = None
+) -> Found | None:
+    """The state to ``tolerance``, or None when it is not an easy one; ``near`` is a state to begin from.
+
+    Where the plain equations lose hoop tension the relaxed energy decides if ``folds`` may be.
+    """
     if film.span > ritz.LONGEST:
         return None
     try:
-        return _climb(_Solver(film, count), tolerance, near)
-    except (ValueError, OverflowError, ZeroDivisionError):
+        return _climb(Solver(film, count), tolerance, folds, near)
+    except (Stray, ValueError, OverflowError, ZeroDivisionError):
         return None
 
 
-def _climb(solver: _Solver, tolerance: float, near: Found | None) -> Found | None:
+def _climb(solver: Solver, tolerance: float, folds: bool, near: Found | None) -> Found:
     goal = ladder.goal(tolerance)
     modes = max(2, ladder.first_modes(solver.film.span, tolerance))
-    solver.lay(modes)
-    c, w = solver.guess() if near is None else solver.carried(near)
+    solver.begin(modes, None if near is None or near.cones else near)
     previous = math.nan
     steps = 0
     while modes <= MOST_MODES:
         for _ in range(MOST_STEPS):
-            c, w, lam, change, stable, tail = solver.step(c, w)
+            lam, change, tail = solver.step(goal)
             steps += 1
-            if not change <= 0.8 or min(w) <= 0.0:
-                return None
+            if not change <= (WILD if solver.cones else 0.8):
+                raise Stray
             if change <= goal:
                 break
         else:
-            return None
-        if not (stable and lam > 0.0):
-            return None
+            raise Stray
+        if folds and not solver.cones and min(solver.panels[0].tension) <= ladder.FOLDED * solver.top:
+            modes = solver.fold(tolerance)
+            previous = math.nan
+            continue
+        if not (solver.stable and lam > 0.0):
+            raise Stray
         error = ladder.estimate(lam, previous, change, tail, tolerance)
         if error <= tolerance:
-            return solver.found(c, w, lam, error, steps)
+            answer = found(solver, lam, error, steps)
+            if not folds or (solver.cones and solver.admissible(tolerance)):
+                return answer
+            if solver.cones:
+                raise Stray
+            if answer.hoop >= ladder.FLAT * answer.meridional:
+                return answer
+            modes = solver.fold(tolerance)
+            previous = math.nan
+            continue
         previous = lam
         modes = ladder.next_modes(modes)
-        c, w = solver.refine(c, w, modes)
-    return None
+        solver.refine(modes)
+    raise Stray

@@ -27,6 +27,7 @@ from model.ritz import Grid, Points, Problem, State
 START_MODES = 5
 MOST_ZONES = 5
 ROUNDS = 4
+SLACK = 3.0  # times the root of the tolerance: share of the largest tension that may have a wrong sign beside a cut
 CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
 
 
@@ -325,7 +326,10 @@ def _round(
             for answer in done:
                 solved = film.take(answer.index)
                 now = zones(
-                    answer.grid, answer.state, ritz.evaluate(solved, answer.grid, answer.state), slack=tolerance**0.5
+                    answer.grid,
+                    answer.state,
+                    ritz.evaluate(solved, answer.grid, answer.state),
+                    slack=SLACK * tolerance**0.5,
                 )
                 same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
                 answer.index = where[answer.index]
