@@ -111,6 +111,24 @@ def run(scene: Path, protocol: Path, out: Path, ports: Path | None, arm: bool, y
 
 
 @main.command()
+@click.argument("log", type=FILE)
+@click.option("-o", "--out", type=FILE, required=True, help="Log to write; never overwrites.")
+@click.option("--ports", type=FILE, help="Ports by role, as for `dea-rig run`.")
+@click.option("--arm", is_flag=True, help="As for `dea-rig run`.")
+@click.option("--yes", is_flag=True, help="As for `dea-rig run`.")
+@click.option("--take-down", is_flag=True, help="As for `dea-rig run`.")
+def resume(log: Path, out: Path, ports: Path | None, arm: bool, yes: bool, take_down: bool) -> None:
+    """Go on with the run in LOG that ended early: its next step, the same specimen, the same instruments."""
+    from rig.commands.run import run_and_tell
+    from rig.outputs import check_new
+    from rig.resume import prepare_resumed
+
+    check_new(out)
+    experiment = prepare_resumed(log, _read_ports(ports) if ports is not None else None)
+    run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down)
+
+
+@main.command()
 @click.argument("log", required=False, type=FILE)
 def stop(log: Path | None) -> None:
     """End the run that is going on, as Ctrl-C does; a second time hastens it. LOG names the run."""

@@ -314,7 +314,7 @@ class Engine:
         )
         if table.serial is not None and table.serial != found.serial:
             raise ConfigError(
-                f"{role}: the scene names serial number {table.serial}, but {found.serial or 'no serial number'} "
+                f"{role}: serial number {table.serial} is wanted, but {found.serial or 'no serial number'} "
                 "answered. Are two instruments swapped? Nothing was moved and no output changed."
             )
         certificate = self._certificates.get(role)

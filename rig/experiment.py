@@ -7,7 +7,7 @@ import platform
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -47,6 +47,8 @@ class Experiment:
     certificates: dict[str, Certificate]
     actions: list[Action]
     predictions: list[Prediction]
+    resumed: dict[str, str] | None = None  # of which log this is the rest, for the log
+    stored_zero: float | None = None  # of the force sensor, from the run that this one goes on with
 
     @property
     def duration(self) -> float:
@@ -131,7 +133,7 @@ def run(
                 bench,
                 experiment.actions,
                 log,
-                gains_of(certificates),
+                _gains(experiment),
                 control,
                 progress,
                 certificates,
@@ -193,6 +195,12 @@ def gains_of(certificates: dict[str, Certificate]) -> Gains:
     return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit, force.stored_zero)
 
 
+def _gains(experiment: Experiment) -> Gains:
+    """The gains; where no certificate has a stored zero of the force sensor, that of the run gone on with serves."""
+    gains = gains_of(experiment.certificates)
+    return gains if gains.stored_zero is not None else replace(gains, stored_zero=experiment.stored_zero)
+
+
 def _log(out: Path, scene: Scene) -> LogWriter | LogProcess:
     """On real ports a process of its own writes the log; in memory, the same run gives the same bytes."""
     if scene.on_real_ports and os.name == "posix":
@@ -238,5 +246,7 @@ def _attach(
             "certificate_problems": "; ".join(problems),
         },
     )
+    if experiment.resumed is not None:
+        log.metadata("resumed", experiment.resumed)
     for name, table in origin.items():
         log.metadata(name, table)

@@ -7,7 +7,7 @@ anything moves, and what the engine then carries out.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,11 +15,12 @@ import numpy as np
 from model.membrane import Status, solve, solve_many
 from model.specimen import Specimen
 from rig import protocol as steps
-from rig.errors import LimitError
+from rig.errors import ConfigError, LimitError
 from rig.safety.limits import Limits, capacitance
 from rig.scene import Scene
 
 HOMING_S = 20.0  # only for the estimate: a long-travel stage at its homing speed
+REGAIN_SPEED = 2e-3  # m/s, on the way back to where a resumed step begins
 POINTS = 13  # displacements per action at which the prediction is made
 
 
@@ -74,10 +75,58 @@ def plan(protocol: steps.Protocol, scene: Scene) -> list[Action]:
         When the protocol needs what the scene does not have (a voltage without ``[hv]``), or asks for steps in an
         order that cannot work. Numerical limits are checked by `check_plan`.
     """
-    return list(_actions(protocol, scene))
+    return list(_actions(enumerate(protocol.step, start=1), scene))
 
 
-def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
+@dataclass(frozen=True)
+class Regain:
+    """Back to the displacement (m) and the voltage with which a resumed step begins."""
+
+    h: float
+    voltage: float
+    speed: float
+    do: str = "resume"
+
+
+def plan_from(protocol: steps.Protocol, scene: Scene, first: int, skipped: Collection[int] = ()) -> list[Action]:
+    """The actions from step ``first`` on, with what has to be done again before it.
+
+    Home, zero and approach are done again, and the preconditioning of the film in contact, but for the steps
+    ``skipped``; then the displacement and the voltage are regained with which the step begins.
+
+    Raises
+    ------
+    ConfigError
+        There is no such step.
+    LimitError
+        As `plan`.
+    """
+    numbered = list(enumerate(protocol.step, start=1))
+    whole = plan(protocol, scene)
+    if not 1 <= first <= len(numbered):
+        raise ConfigError(f"The protocol has no step {first} to go on with.")
+    while first <= len(numbered) and isinstance(numbered[first - 1][1], steps.Return):
+        first += 1  # the way back has been done again with the reference position
+    begin = next((action for action in whole if action.step >= first), None)
+    if begin is None:
+        raise ConfigError("Nothing but the way back is left to be done of this protocol.")
+    done, left = numbered[: first - 1], numbered[first - 1 :]
+    since = max((number for number, step in done if isinstance(step, steps.Return)), default=0)
+    again: dict[int, steps.Step] = {}
+    for kind in (steps.Home, steps.Zero):  # the last of each, wherever it was
+        again |= dict([entry for entry in done if isinstance(entry[1], kind)][-1:])
+    if any(isinstance(step, steps.Approach) for number, step in done if number > since):
+        for number, step in done:
+            if number > since and isinstance(step, steps.Approach | steps.Precondition) and number not in skipped:
+                again[number] = step
+    before: list[tuple[int, steps.Step | Regain]] = sorted(again.items())
+    if begin.h[0] > 0 or begin.voltage[0] > 0:
+        speed = min(REGAIN_SPEED, scene.limits.speed_mm_per_s * 1e-3)
+        before.append((first, Regain(begin.h[0], begin.voltage[0], speed)))
+    return list(_actions([*before, *left], scene))
+
+
+def _actions(numbered: Iterable[tuple[int, steps.Step | Regain]], scene: Scene) -> Iterator[Action]:
     h, v = 0.0, 0.0
     homed = zeroed = contact = False
     ramp_rate = scene.hv.ramp_V_per_s if scene.hv is not None else float("inf")
@@ -92,7 +141,7 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
         duration = abs(target - h) / speed
         return Action(number, kind, label, (h, target), (v, v), duration, speed, cycle, record)
 
-    for number, step in enumerate(protocol.step, start=1):
+    for number, step in numbered:
         kind = step.do
         wanted = max([*getattr(step, "voltages_V", []), getattr(step, "voltage_V", 0.0)])
         if wanted > 0 and scene.hv is None:
@@ -187,6 +236,13 @@ def _actions(protocol: steps.Protocol, scene: Scene) -> Iterator[Action]:
             if v > 0:
                 yield voltage_to(number, kind, 0.0, step.settle_s)
                 v = 0.0
+        elif isinstance(step, Regain):
+            if step.h != h:
+                yield move_to(number, kind, step.h, step.speed, 0, record=False)
+                h = step.h
+            if step.voltage > 0:
+                yield voltage_to(number, kind, step.voltage, 1.0)
+                v = step.voltage
         elif isinstance(step, steps.Return):
             if v > 0:
                 yield voltage_to(number, kind, 0.0, 0.0)

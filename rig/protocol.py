@@ -48,6 +48,7 @@ class Precondition(Table):
     displacement_mm: Positive
     speed_mm_per_s: Positive
     cycles: Cycles = 3
+    valid_for_min: NotNegative = 60.0  # a run resumed within this time does not precondition again
 
 
 class Ramp(Table):
