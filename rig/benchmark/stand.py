@@ -120,14 +120,15 @@ class Stand:
         self._buffer = b""
         self._runs: list[Run] = []
 
-    def start(self) -> Run:
-        """Power-cycle the supply and start a run; returns once there is an engine."""
+    def start(self, *, power_cycle: bool = True) -> Run:
+        """Start a run, by default after switching the supply off and on; returns once there is an engine."""
         if self._nursery is None:
             command = [sys.executable, "-m", "rig.benchmark.nursery", str(self.scene), str(self.protocol)]
             self._nursery = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             while self._line() != "ready":
                 pass
-        self.bench.power_cycle()
+        if power_cycle:
+            self.bench.power_cycle()
         run = Run(self, self.folder / f"run-{len(self._runs)}.mcap")
         assert self._nursery.stdin is not None
         self._nursery.stdin.write(json.dumps({"ports": dict(self.bench.ports), "log": str(run.log)}).encode() + b"\n")
@@ -199,14 +200,15 @@ class Stand:
     def _listen(self, seconds: float) -> None:
         self._read(seconds)
         while b"\n" in self._buffer:
-            word, *numbers = self._line().split()
-            run = self._runs[-1]
+            word, engine, *rest = self._line().split()
             if word == "engine":
-                run.engine = int(numbers[0])
-            elif word == "guard" and int(numbers[0]) == run.engine:
-                run.guard = int(numbers[1])
-            elif word == "ended" and int(numbers[0]) == run.engine:
-                run.status = int(numbers[1])
+                self._runs[-1].engine = int(engine)
+                continue
+            run = next(run for run in self._runs if run.engine == int(engine))
+            if word == "guard":
+                run.guard = int(rest[0])
+            else:
+                run.status = int(rest[0])
 
     def __enter__(self) -> Self:
         self.bench.__enter__()

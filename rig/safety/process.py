@@ -329,9 +329,10 @@ class Server:
         """The engine has gone without taking leave, from a supply that it had commanded."""
         cause = "the engine has ended without taking leave"
         began = self._clock.now()
-        if guard.state is GuardState.SAFE and guard.output_is_safe:
-            cause = f"{cause}; before that: {guard.cause}"
-        else:
+        safe = guard.state is GuardState.SAFE
+        if safe:
+            cause = f"{cause}, after {guard.cause}"
+        if not (safe and guard.output_is_safe):
             self._off(guard, cause)
         while not guard.output_is_safe and self._clock.now() - began < TRY_S:
             try:

@@ -1,0 +1,197 @@
+"""Engine and guard as real processes over pseudo-terminals and slcan: killed, stopped, hung, lost.
+
+What is asserted is what the simulated supply's own output did. Times are generous multiples of what is required (50 ms
+and 200 ms): a busy machine must not fail them; `dea-rig benchmark safety` measures the distribution.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rig.benchmark.safety import kill_many
+from rig.benchmark.stand import Run, Stand
+from rig.log.reader import read_log
+from rig.sim.bench import SimulatedBench
+from rig.sim.settings import Fault
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
+
+KILLED_S, HUNG_S = 0.5, 1.5  # ten times and seven times what is required
+
+
+@pytest.fixture(scope="module")
+def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
+    with Stand(tmp_path_factory.mktemp("stand"), hold_s=30.0) as stand:
+        yield stand
+
+
+@pytest.fixture
+def live(stand: Stand) -> Run:
+    """A run with voltage on, in its hold."""
+    run = stand.start()
+    stand.wait_until_live(run, 780.0)
+    return run
+
+
+def commands(run: Run) -> list[str]:
+    """What was commanded of the supply, by a log that was not finished, or was."""
+    path = run.log if run.log.exists() else run.log.with_name(run.log.name + ".part")
+    return [m.fields["command"] for m in read_log(path).messages("/command") if m.fields["device"] == "hv"]
+
+
+def off_after(stand: Stand, at: float, seconds: float) -> float:
+    """Seconds until the supply was sent to zero; then nothing may send it anywhere else."""
+    stand.wait(lambda: stand.off_after(at) is not None, "the output's end")
+    driven = stand.off_after(at)
+    assert driven is not None
+    assert driven.t - at < seconds
+    return driven.t - at
+
+
+def stays_off(stand: Stand, at: float) -> None:
+    driven = stand.off_after(at)
+    assert driven is not None
+    assert all(one.target == 0.0 for one in stand.bench.driven if one.t > driven.t)
+    stand.wait(lambda: stand.bench.voltage() < 60.0, "the output's discharge")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT])
+def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
+    at = stand.kill(live.engine, number)
+    off_after(stand, at, KILLED_S)
+    stand.wait_until_alone(live)
+    stays_off(stand, at)
+    assert "without taking leave. The high voltage is off, measured" in live.said
+    # The guard's own end of the log outlives the engine: the command, and the measured proof of what came of it.
+    assert commands(live)[-1] == "emergency_off"
+    log = read_log(live.log.with_name(live.log.name + ".part"))
+    last = log.columns("/hv/sample")["voltage_V"][-2:]
+    assert (abs(last) < 60.0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(840)
+def test_engine_killed_at_200_random_instants(tmp_path: Path) -> None:
+    row = kill_many(tmp_path, 200, at_once=4, seed=1)
+    assert len(row.ms) + row.without == 200
+    assert len(row.ms) > 40  # so many had voltage on, or on its way
+    assert row.never == 0
+    assert row.quantile(0.5) < 1e3 * KILLED_S
+    assert max(row.ms) < 1e3 * 4 * KILLED_S
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGUSR1], ids=["stopped", "busy"])
+def test_engine_hung(stand: Stand, live: Run, number: signal.Signals) -> None:
+    """Stopped, or in a loop that never comes back (the nursery's handler of SIGUSR1)."""
+    at = stand.kill(live.engine, number)
+    off_after(stand, at, HUNG_S)
+    stays_off(stand, at)
+    assert live.status is None  # it is still there
+    stand.kill(live.engine)
+    stand.wait_until_alone(live)
+    assert "silent for" in live.said
+    stays_off(stand, at)
+
+
+def test_engine_that_was_stopped_and_goes_on_gets_no_voltage_any_more(stand: Stand, live: Run) -> None:
+    at = stand.kill(live.engine, signal.SIGSTOP)
+    off_after(stand, at, HUNG_S)
+    stand.kill(live.engine, signal.SIGCONT)
+    stand.wait_until_alone(live)
+    stays_off(stand, at)
+    assert live.status == 4
+    assert "silent for" in live.said
+    assert read_log(live.log).outcome["safe"] == "yes"  # type: ignore[index]
+
+
+def test_guard_killed(stand: Stand, live: Run) -> None:
+    at = stand.kill(live.guard)
+    off_after(stand, at, HUNG_S)
+    stand.wait_until_alone(live)
+    stays_off(stand, at)
+    assert live.status == 4 and "the guard is lost (its process has died)" in live.said
+    outcome = read_log(live.log).outcome
+    assert outcome is not None and outcome["safe"] == "yes" and outcome["status"] == "fault"
+    assert outcome["stage_standing"] == "yes"
+    assert commands(live)[-1] == "emergency_off"
+
+
+def test_guard_that_hangs_is_ended_and_replaced_by_the_engine(stand: Stand, live: Run) -> None:
+    at = stand.kill(live.guard, signal.SIGSTOP)
+    off_after(stand, at, 10 * HUNG_S)
+    stand.wait_until_alone(live)
+    stays_off(stand, at)
+    assert live.status == 4 and "the guard is lost" in live.said
+    assert read_log(live.log).outcome["safe"] == "yes"  # type: ignore[index]
+
+
+def test_guard_ignores_signals_that_end_programs(stand: Stand, live: Run) -> None:
+    at = stand.bench.clock.now()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        stand.kill(live.guard, number)
+    stand.wait(lambda: stand.bench.clock.now() > at + 0.5, "half a second")
+    assert stand.off_after(at) is None and live.status is None
+    at = stand.kill(live.engine, signal.SIGTERM)  # the engine's own end takes it with it
+    stand.wait_until_alone(live)
+    assert live.status == 130
+    stays_off(stand, at)
+
+
+def test_engine_and_guard_killed_leave_the_voltage_to_the_hardware(stand: Stand, live: Run) -> None:
+    """Stated plainly: nothing in software is left to act. The next start finds the output live and touches nothing."""
+    at = stand.kill(live.guard, signal.SIGSTOP)
+    stand.kill(live.engine)
+    stand.kill(live.guard)
+    stand.wait_until_alone(live)
+    stand.wait(lambda: stand.bench.clock.now() > at + 1.0, "a second")
+    assert stand.off_after(at) is None and stand.bench.voltage() > 780.0
+    readme = (Path(__file__).resolve().parents[2] / "README.md").read_text()
+    assert "both are killed" in " ".join(readme.split())
+    again = stand.start(power_cycle=False)
+    stand.wait_until_alone(again)
+    assert again.status == 4 and "though nobody switched it on from here" in again.said
+    assert stand.off_after(at) is None and stand.bench.voltage() > 780.0
+
+
+@pytest.mark.slow
+def test_engine_killed_with_a_supply_that_does_not_obey_is_called_not_safe(stand: Stand, live: Run) -> None:
+    def stick(bench: SimulatedBench) -> None:
+        bench.inject(Fault(role="hv", kind="stuck_on"))
+
+    stand.do(stick)
+    at = stand.kill(live.engine)
+    stand.wait(lambda: "NOT SAFE" in live.said, "the guard's word")
+    assert stand.bench.voltage() > 780.0
+    stand.do(lambda bench: setattr(bench.instruments["hv"], "stuck_on", False))
+    stand.wait_until_alone(live)  # it was told again meanwhile, and obeys now
+    stays_off(stand, at)
+    assert "The high voltage is off, measured" in live.said
+
+
+@pytest.mark.slow
+def test_a_bus_that_is_pulled_with_voltage_on_ends_the_run_as_not_safe(stand: Stand, live: Run) -> None:
+    stand.do(lambda bench: bench.inject(Fault(role="hv", kind="vanish", duration_s=30.0)))
+    stand.wait_until_alone(live)
+    assert live.status == 4 and stand.bench.voltage() > 780.0  # no command can reach it
+    outcome = read_log(live.log).outcome
+    assert outcome is not None and outcome["safe"] == "NO" and outcome["stage_standing"] == "yes"
+    assert "NOT SAFE" in "".join(m.fields["message"] for m in read_log(live.log).messages("/event"))
+
+
+def test_a_second_run_on_the_same_ports_is_refused_and_disturbs_nothing(stand: Stand, live: Run) -> None:
+    at = stand.bench.clock.now()
+    second = stand.start(power_cycle=False)
+    stand.wait(lambda: second.status is not None, "the refusal")
+    assert second.status == 4 and "in use" in second.said, second.said
+    assert not second.log.exists() and not second.log.with_name(second.log.name + ".part").exists()
+    assert live.status is None and stand.off_after(at) is None and stand.bench.voltage() > 780.0
+    at = stand.kill(live.engine, random.Random(1).choice([signal.SIGINT, signal.SIGHUP]))
+    stand.wait_until_alone(live)
+    assert live.status == 130
+    stays_off(stand, at)
