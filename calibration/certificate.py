@@ -16,8 +16,13 @@ A certificate is a small TOML file, kept beside the scenes that use it and attac
     range_N = [-1.0, 1.0]                # calibrated range; no extrapolation
 
 A force sensor that states newtons itself has ``gain_N_per_N`` and ``zero_reading_N`` instead. The keys of a
-displacement certificate end in
-``_m`` with ``gain_m_per_m``, those of an HV certificate in ``_V`` with ``gain_V_per_V``.
+displacement certificate end in ``_m`` with ``gain_m_per_m``, those of an HV certificate in ``_V`` with
+``gain_V_per_V``. A stage's certificate has the rig's ``compliance_m_per_N`` and ``compliance_uncertainty_m_per_N`` in
+place of gain, noise and zero.
+
+``lag_s`` and ``lag_uncertainty_s`` say by how much a sample's time stamp is later than what it shows. A certificate
+that `dea-rig calibrate` wrote also holds its evidence: ``data_sha256`` of the log, ``[findings]``, ``[[budget]]`` and
+``[[standstill]]``; they are for people and change nothing in how it is used.
 """
 
 from __future__ import annotations
@@ -34,7 +39,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 FORMAT = "dea-rig certificate 1"
 LARGEST_BYTES = 256 * 1024  # a certificate is a page; a larger file is a mistake or an attack on the parser
 
-Role = Literal["force", "displacement", "hv"]
+Role = Literal["force", "displacement", "hv", "stage"]
 
 
 class CertificateError(ValueError):
@@ -66,6 +71,10 @@ class Certificate:
         File name, for messages.
     raw : bytes
         The file itself, byte for byte.
+    lag, lag_uncertainty : float
+        By how much a sample's time stamp is later than what it shows (s), and the standard uncertainty of that.
+    compliance, compliance_uncertainty : float
+        Of the rig (m/N); a stage's certificate only.
     """
 
     role: Role
@@ -83,6 +92,10 @@ class Certificate:
     high: float
     name: str
     raw: bytes
+    lag: float = 0.0
+    lag_uncertainty: float = 0.0
+    compliance: float = 0.0
+    compliance_uncertainty: float = 0.0
 
     @property
     def sha256(self) -> str:
@@ -139,7 +152,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
     except ValidationError as error:
         lines = []
         for item in error.errors(include_url=False, include_context=False):
-            where = [str(part) for part in item["loc"] if part not in ("force", "displacement", "hv")]
+            where = [str(part) for part in item["loc"] if part not in ("force", "displacement", "hv", "stage")]
             value = "" if item["type"] in ("missing", "extra_forbidden") else f" (it is {item['input']!r})"
             lines.append(f"{name}: {'.'.join(where) or 'certificate'}: {item['msg']}{value}")
         raise CertificateError("\n".join(lines)) from error
@@ -152,6 +165,15 @@ Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 Text = Annotated[str, Field(min_length=1, max_length=200)]
 
 
+class _Line(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    component: Text
+    type: Literal["A", "B"]
+    relative: NotNegative
+    note: Annotated[str, Field(max_length=200)] = ""
+
+
 class _File(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -161,7 +183,12 @@ class _File(BaseModel):
     valid_from: date
     valid_until: date
     method: Text | None = None
-    gain_relative_uncertainty: Relative
+    lag_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    lag_uncertainty_s: NotNegative = 0.0
+    data_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
+    findings: dict[str, float] = Field(default_factory=dict)
+    budget: list[_Line] = Field(default_factory=list, max_length=100)
+    standstill: list[dict[str, float | str]] = Field(default_factory=list, max_length=2000)
 
     @model_validator(mode="after")
     def _in_order(self) -> _File:
@@ -172,15 +199,16 @@ class _File(BaseModel):
     def _certificate(
         self,
         role: Role,
-        gain: float,
-        unit: str,
+        gain: tuple[float, str, float],
         noise: float,
         zero: float,
         ends: list[float],
         name: str,
         raw: bytes,
         stored_zero: float | None = None,
+        compliance: tuple[float, float] = (0.0, 0.0),
     ) -> Certificate:
+        """``gain`` is the gain itself, the unit of the reading, and its relative uncertainty."""
         low, high = ends
         if not low < high:
             raise CertificateError(f"{name}: the range must run from the lower to the higher end, it is {ends}")
@@ -190,9 +218,9 @@ class _File(BaseModel):
             serial=self.serial,
             valid_from=self.valid_from,
             valid_until=self.valid_until,
-            gain=gain,
-            reading_unit=unit,
-            gain_uncertainty=self.gain_relative_uncertainty,
+            gain=gain[0],
+            reading_unit=gain[1],
+            gain_uncertainty=gain[2],
             noise=noise,
             zero_uncertainty=zero,
             stored_zero=stored_zero,
@@ -200,6 +228,10 @@ class _File(BaseModel):
             high=high,
             name=name,
             raw=raw,
+            lag=self.lag_s,
+            lag_uncertainty=self.lag_uncertainty_s,
+            compliance=compliance[0],
+            compliance_uncertainty=compliance[1],
         )
 
 
@@ -207,6 +239,7 @@ class _ForceFile(_File):
     role: Literal["force"]
     gain_N_per_mV_per_V: Positive | None = None
     gain_N_per_N: Positive | None = None
+    gain_relative_uncertainty: Relative
     zero_reading_mV_per_V: float | None = None
     zero_reading_N: float | None = None
     noise_N: Positive
@@ -225,37 +258,49 @@ class _ForceFile(_File):
         gain, unit = (self.gain_N_per_mV_per_V, "mV/V") if self.gain_N_per_N is None else (self.gain_N_per_N, "N")
         assert gain is not None  # _one_gain
         zero = self.zero_reading_mV_per_V if unit == "mV/V" else self.zero_reading_N
+        measures = gain, unit, self.gain_relative_uncertainty
         return self._certificate(
-            "force", gain, unit, self.noise_N, self.zero_uncertainty_N, self.range_N, name, raw, zero
+            "force", measures, self.noise_N, self.zero_uncertainty_N, self.range_N, name, raw, stored_zero=zero
         )
 
 
 class _DisplacementFile(_File):
     role: Literal["displacement"]
     gain_m_per_m: Positive
+    gain_relative_uncertainty: Relative
     noise_m: NotNegative
     zero_uncertainty_m: NotNegative
     range_m: Range
 
     def certificate(self, name: str, raw: bytes) -> Certificate:
-        return self._certificate(
-            "displacement", self.gain_m_per_m, "m", self.noise_m, self.zero_uncertainty_m, self.range_m, name, raw
-        )
+        gain = self.gain_m_per_m, "m", self.gain_relative_uncertainty
+        return self._certificate("displacement", gain, self.noise_m, self.zero_uncertainty_m, self.range_m, name, raw)
 
 
 class _HVFile(_File):
     role: Literal["hv"]
     gain_V_per_V: Positive
+    gain_relative_uncertainty: Relative
     noise_V: NotNegative
     zero_uncertainty_V: NotNegative
     range_V: Range
 
     def certificate(self, name: str, raw: bytes) -> Certificate:
-        return self._certificate(
-            "hv", self.gain_V_per_V, "V", self.noise_V, self.zero_uncertainty_V, self.range_V, name, raw
-        )
+        gain = self.gain_V_per_V, "V", self.gain_relative_uncertainty
+        return self._certificate("hv", gain, self.noise_V, self.zero_uncertainty_V, self.range_V, name, raw)
 
 
-_FILE: TypeAdapter[_ForceFile | _DisplacementFile | _HVFile] = TypeAdapter(
-    Annotated[_ForceFile | _DisplacementFile | _HVFile, Field(discriminator="role")]
+class _StageFile(_File):
+    role: Literal["stage"]
+    compliance_m_per_N: NotNegative
+    compliance_uncertainty_m_per_N: NotNegative
+    range_N: Range
+
+    def certificate(self, name: str, raw: bytes) -> Certificate:
+        compliance = self.compliance_m_per_N, self.compliance_uncertainty_m_per_N
+        return self._certificate("stage", (1.0, "m", 0.0), 0.0, 0.0, self.range_N, name, raw, compliance=compliance)
+
+
+_FILE: TypeAdapter[_ForceFile | _DisplacementFile | _HVFile | _StageFile] = TypeAdapter(
+    Annotated[_ForceFile | _DisplacementFile | _HVFile | _StageFile, Field(discriminator="role")]
 )

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.roles import DisplacementSample, ForceSample, HVFlag, Sample, StageSample
+from rig.calibrate.steps import CALIBRATION
 from rig.control import Question
 from rig.errors import FaultError, LimitError
 from rig.plan import Action
@@ -37,6 +38,10 @@ ARRIVAL_M = 50e-6  # a stage that says it is done must be this near to where it 
 
 def carry_out(engine: Engine, action: Action) -> Turns:
     """The generator that carries out ``action``."""
+    if action.kind in CALIBRATION:
+        from rig.calibrate.actions import carry_out as calibrate
+
+        return calibrate(engine, action)
     return _BY_KIND.get(action.kind, _move_or_voltage)(engine, action)
 
 
@@ -49,14 +54,14 @@ def _wait(engine: Engine, done: Callable[[], bool], limit: float, what: str) -> 
         yield
 
 
-def _pause(engine: Engine, duration: float) -> Turns:
+def pause(engine: Engine, duration: float) -> Turns:
     end = engine.clock.now() + duration
     while engine.clock.now() < end:
         yield
 
 
 @contextmanager
-def _listening(engine: Engine, listener: Callable[[Sample], None]) -> Iterator[None]:
+def listening(engine: Engine, listener: Callable[[Sample], None]) -> Iterator[None]:
     """Within this context every sample is told to ``listener`` as it arrives."""
     engine.listener = listener
     try:
@@ -91,8 +96,8 @@ def _zero(engine: Engine, action: Action) -> Turns:
         elif isinstance(sample, DisplacementSample):
             laser.append(sample.displacement)
 
-    with _listening(engine, listen):
-        yield from _pause(engine, action.parameters["duration"])
+    with listening(engine, listen):
+        yield from pause(engine, action.parameters["duration"])
     zero, error = _mean(force, "force")
     check_zero(engine.limits, recorder.from_stored_zero(zero))
     recorder.force_zero = zero
@@ -139,7 +144,7 @@ def _approach(engine: Engine, action: Action) -> Turns:
     def met_already() -> bool:
         return len(newest) == n and not abs(float(np.mean(newest))) <= threshold
 
-    with _listening(engine, feel):
+    with listening(engine, feel):
         engine.move_stage(start, action.parameters["fast"])
         way_there = "The stage's way to where approaching begins"
         yield from _wait(engine, lambda: not stage.moving or met_already(), _patience(action), way_there)
@@ -158,7 +163,7 @@ def _approach(engine: Engine, action: Action) -> Turns:
         elif isinstance(sample, ForceSample):
             met.append((sample.t, recorder.quantity_of(sample)))
 
-    with _listening(engine, listen):
+    with listening(engine, listen):
         engine.move_stage(goal, action.speed)
         end = engine.clock.now() + _patience(action)
         while not (mean := _mean_of_last(met, n)) > threshold:
@@ -198,8 +203,8 @@ def _contact_by_laser(engine: Engine) -> Generator[None, None, tuple[float, floa
         if isinstance(sample, DisplacementSample):
             laser.append(recorder.quantity_of(sample))
 
-    with _listening(engine, listen):
-        yield from _pause(engine, 0.5)
+    with listening(engine, listen):
+        yield from pause(engine, 0.5)
     displacement, error = _mean(laser, "displacement")
     assert recorder.stage is not None
     return recorder.stage.position - displacement, error
@@ -221,12 +226,12 @@ def _corner(x: NDArray[np.float64], force: NDArray[np.float64]) -> tuple[float, 
 
 
 def _hold(engine: Engine, action: Action) -> Turns:
-    yield from _pause(engine, action.parameters["duration"])
+    yield from pause(engine, action.parameters["duration"])
 
 
 def _move_or_voltage(engine: Engine, action: Action) -> Turns:
     if "settle" in action.parameters:
-        yield from _set_voltage(engine, action)
+        yield from set_voltage(engine, action)
     elif action.moves:
         yield from _move(engine, action)
 
@@ -235,12 +240,19 @@ def _move(engine: Engine, action: Action) -> Turns:
     yield from _go(engine, action.h[1], action.speed, _patience(action))
 
 
+def stand_still(engine: Engine, action: Action) -> Turns:
+    """Wait until the stage says that it stands, and for its position there."""
+    stage = engine.bench.stage
+    yield from _wait(engine, lambda: not stage.moving, _patience(action), "The end of the stage's move")
+    yield from pause(engine, 2 / engine.bench.scene.stage.poll_rate_Hz)
+
+
 def _go(engine: Engine, h: float, speed: float, limit: float) -> Turns:
     """Move to displacement ``h`` and make sure that the stage says it is there."""
     stage, recorder = engine.bench.stage, engine.recorder
     engine.move_to(h, speed)
     yield from _wait(engine, lambda: not stage.moving, limit, "The end of the stage's move")
-    yield from _pause(engine, 2 / engine.bench.scene.stage.poll_rate_Hz)
+    yield from pause(engine, 2 / engine.bench.scene.stage.poll_rate_Hz)
     assert recorder.stage is not None
     missed = recorder.stage.position - (recorder.contact + h)
     if not abs(missed) <= ARRIVAL_M:
@@ -250,10 +262,10 @@ def _go(engine: Engine, h: float, speed: float, limit: float) -> Turns:
         )
 
 
-def _set_voltage(engine: Engine, action: Action) -> Turns:
+def set_voltage(engine: Engine, action: Action) -> Turns:
     """Ramp and wait for the *measured* voltage to arrive, then settle."""
     yield from _ramp_to(engine, action.voltage[1], _patience(action))
-    yield from _pause(engine, action.parameters["settle"])
+    yield from pause(engine, action.parameters["settle"])
 
 
 def _ramp_to(engine: Engine, target: float, limit: float) -> Turns:
@@ -307,7 +319,8 @@ def choose_about_live_output(engine: Engine) -> Turns:
     if not said:
         if engine.control.unattended:
             return  # nobody can choose: the run ends with the output as it was found
-        said = yield from engine.ask(Question(f"{found} Nothing was changed. Ramp it down to zero?", "take down"))
+        answer = yield from engine.ask(Question(f"{found} Nothing was changed. Ramp it down to zero?", "take down"))
+        said = str(answer)
     limit = guard.ramp_duration * PATIENCE + GRACE_S
     guard.take_down(f"found live; {said}")
     yield from _until_off(engine, limit)
@@ -356,7 +369,7 @@ def rest(engine: Engine, action: Action) -> Turns:
 
 def _return(engine: Engine, action: Action) -> Turns:
     if "settle" in action.parameters:
-        yield from _set_voltage(engine, action)
+        yield from set_voltage(engine, action)
         return
     yield from _move(engine, action)
     engine.recorder.contact = math.nan

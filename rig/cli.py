@@ -156,6 +156,60 @@ def continue_(log: Path | None) -> None:
 
 
 @main.command()
+@click.argument("quantity", type=click.Choice(["force", "displacement", "compliance", "hv", "timing"]))
+@click.argument("source", type=FILE)
+@click.option("-o", "--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="Directory.")
+@click.option("--protocol", type=FILE, help="Steps to run in place of the usual ones.")
+@click.option("--valid-days", type=click.IntRange(1, 3650), default=365, show_default=True, help="Of the certificate.")
+@click.option("--arm", is_flag=True, help="Allow high voltage on real ports (hv only).")
+@click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
+def calibrate(
+    quantity: Any, source: Path, out: Path, protocol: Path | None, valid_days: int, arm: bool, yes: bool
+) -> None:
+    """Calibrate an instrument on the bench of SOURCE, a scene, and write its certificate; or from SOURCE, a log.
+
+    force: weights. displacement: the laser against the stage. compliance: the rig, against a rigid dummy. hv: the
+    monitor against a reference meter. timing: how far laser and force lag behind the stage.
+    """
+    from rig.calibrate.command import calibrate as calibrate_
+    from rig.commands.run import run_and_tell
+    from rig.tables import calibration_table, show
+
+    def run(experiment: Any, log: Path) -> None:
+        run_and_tell(experiment, log, arm=arm, yes=yes, take_down=False)
+
+    found, written = calibrate_(quantity, source, out, run, protocol, valid_days)
+    show(*calibration_table(found))
+    for path in written:
+        click.echo(f"written: {path}")
+
+
+@main.command()
+@click.argument("quantity", type=click.Choice(["force", "displacement", "hv"]))
+@click.argument("scene", type=FILE)
+@click.option("--standard", type=click.FloatRange(min=0, min_open=True), required=True, help="In g, mm or V.")
+@click.option("-o", "--out", type=FILE, required=True, help="Log to write; never overwrites.")
+@click.option("--arm", is_flag=True, help="Allow high voltage on real ports (hv only).")
+@click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
+def verify(quantity: Any, scene: Path, standard: float, out: Path, arm: bool, yes: bool) -> None:
+    """Daily one-point check: does the sensor still agree with its certificate? Exit code 1 if not."""
+    from rig.calibrate.command import verify as verify_
+    from rig.commands.run import run_and_tell
+
+    def run(experiment: Any, log: Path) -> None:
+        run_and_tell(experiment, log, arm=arm, yes=yes, take_down=False)
+
+    found = verify_(quantity, scene, standard, out, run)
+    click.echo(
+        f"{quantity}: applied {found.applied:.6g} {found.unit}, measured {found.measured:.6g} {found.unit}, "
+        f"U = {found.uncertainty:.2g} {found.unit} (k = 2), E_n = {found.normalised_error:+.2f}: "
+        + ("the certificate holds." if found.passed else "DOES NOT AGREE. Calibrate anew before you measure.")
+    )
+    if not found.passed:
+        sys.exit(1)
+
+
+@main.command()
 @click.argument("scene", type=FILE)
 def sim(scene: Path) -> None:
     """Serve the simulated bench of SCENE, or the log in its place, on pseudo-terminals; prints the ports as JSON."""

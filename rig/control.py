@@ -35,6 +35,9 @@ class Answer:
     text: str
     source: str
 
+    def __str__(self) -> str:
+        return f"{self.text!r}, by {self.source}"
+
 
 class Source(Protocol):
     """Where wishes come from. Reading never waits and never raises."""

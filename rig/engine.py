@@ -18,7 +18,7 @@ from drivers.link import DeviceError, DeviceSilent
 from drivers.roles import HVSample, Sample
 from rig.actions import Turns, carry_out, choose_about_live_output, confirm_voltage, rest
 from rig.bench import Bench
-from rig.control import Control, Question
+from rig.control import Answer, Control, Question
 from rig.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.host import HostTime
 from rig.plan import Action
@@ -179,15 +179,19 @@ class Engine:
         self.bench.stage.stop()
 
     def request_voltage(self, volts: float) -> None:
-        """Ask the guard for a voltage at the displacement where the film is; a guard that is SAFE is armed for it."""
+        """Ask the guard for a voltage at the displacement where the film is; a guard that is SAFE is armed for it.
+
+        Before contact the disk lies where the flat film holds it, at zero.
+        """
         if self.guard is None:
             raise FaultError(f"{volts:g} V asked for, but the scene has no HV.")
         if self.guard.state is GuardState.SAFE:
             self.arming.check(volts)
             self.event("hv", f"armed by two acts: {self.arming.requested}; {self.arming.confirmed}")
             self.guard.arm()
-        self.recorder.target(self.recorder.displacement, volts, 0.0)
-        self.guard.request(volts, self.recorder.displacement)
+        h = self.recorder.displacement if math.isfinite(self.recorder.contact) else 0.0
+        self.recorder.target(h, volts, 0.0)
+        self.guard.request(volts, h)
 
     def event(self, source: str, message: str) -> None:
         """Write to the log what a reader of it should know."""
@@ -198,11 +202,8 @@ class Engine:
         if self._watch is not None and readings:
             self._watch.learn(role, readings)
 
-    def ask(self, question: Question) -> Generator[None, None, str]:
-        """Ask the operator and yield until he has answered; question and answer go into the log.
-
-        Gives back who answered, and what, in words.
-        """
+    def ask(self, question: Question) -> Generator[None, None, Answer]:
+        """Ask the operator and yield until he has answered; question and answer go into the log."""
         self.event("operator", f"asked: {question.text}")
         self.control.put(question)
         try:
@@ -210,9 +211,8 @@ class Engine:
                 yield
         finally:
             self.control.withdraw()
-        said = f"{answer.text!r}, by {answer.source}"
-        self.event("operator", f"answered: {said}")
-        return said
+        self.event("operator", f"answered: {answer}")
+        return answer
 
     # The run -------------------------------------------------------------------------------------------------
 

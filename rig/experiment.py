@@ -14,10 +14,11 @@ from pathlib import Path
 
 from calibration.certificate import Certificate, CertificateError, load_certificate
 from rig.bench import Bench
+from rig.calibrate.steps import CALIBRATION
 from rig.clock import Clock, calendar_now
 from rig.control import Control, Keyboard, Source
 from rig.engine import Engine, Outcome
-from rig.errors import ConfigError, FaultError
+from rig.errors import ConfigError, FaultError, LimitError
 from rig.log import space
 from rig.log.process import LogProcess
 from rig.log.writer import LogWriter
@@ -75,7 +76,9 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
     protocol, protocol_text = load_protocol(protocol_path)
     certificates = _certificates(scene, scene_path.parent)
     actions = plan(protocol, scene)
-    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, check_plan(actions, scene))
+    predictions = check_plan(actions, scene)
+    _check_ranges(certificates, actions, predictions)
+    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions)
 
 
 @dataclass(frozen=True)
@@ -180,6 +183,20 @@ def _certificates(scene: Scene, folder: Path) -> dict[str, Certificate]:
             )
         found[role] = certificate
     return found
+
+
+def _check_ranges(certificates: dict[str, Certificate], actions: list[Action], predictions: list[Prediction]) -> None:
+    """Nothing is planned where a sensor is not calibrated. Calibrations themselves go further."""
+    for action, prediction in zip(actions, predictions, strict=True):
+        if action.kind in CALIBRATION:
+            continue
+        for role, value, unit in (("force", prediction.peak_force, "N"), ("hv", max(action.voltage), "V")):
+            used = certificates.get(role)
+            if used is not None and not value <= used.high:
+                raise LimitError(
+                    f"Step {action.step} ({action.kind}, {action.label}): {value:.4g} {unit} are expected, and "
+                    f"{used.name} is calibrated up to {used.high:.4g} {unit} only. Calibrate further, or ask for less."
+                )
 
 
 def _check_dates(certificates: dict[str, Certificate], clock: Clock) -> list[str]:

@@ -23,6 +23,7 @@ from rig.scene import Scene
 from rig.toml_file import parse_table
 
 # A sample belongs to its curve while the measured voltage is this near to the nominal one.
+NOISE_SIGMAS = 5.0  # by this much of its noise a sensor may read beyond its calibrated range
 VOLTAGE_V, VOLTAGE_PART = 50.0, 0.05
 
 
@@ -51,7 +52,7 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
     LogError, DataError
         When a log cannot be read, lacks what is needed, or the curves cannot be fitted.
     """
-    runs = [load_run(path) for path in paths]
+    runs = [_load(path) for path in paths]
     scenes = [parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)") for run in runs]
     hashes = {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
     provenance: dict[str, object] = {
@@ -65,13 +66,48 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
         for run, scene in zip(runs, scenes, strict=True):
             certificates = _certificates(run)
             found = run.curves(scene.specimen.specimen(), **_errors(run, scene, certificates))
-            curves += [_with_drift(_at_its_voltage(curve), certificates) for curve in found]
+            corrected = [_without_compliance(curve, run, certificates) for curve in found]
+            inside = [_in_calibrated_range(_at_its_voltage(curve), certificates) for curve in corrected]
+            curves += [_with_drift(curve, certificates) for curve in inside]
         if not curves:
             raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
         identification = identify(curves, terms=terms, profiles=profiles, provenance=provenance)
     except (CurveError, IdentificationError, CertificateError) as error:
         raise DataError(f"{error}.") from None
     return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs))
+
+
+def _load(path: Path) -> Run:
+    """The run with what its sensors lag behind, by their certificates, taken off the time stamps."""
+    run = load_run(path)
+    try:
+        lags = {role: one.lag for role, one in _certificates(run).items() if one.lag}
+    except CertificateError as error:
+        raise DataError(f"{error}.") from None
+    return load_run(path, lags) if lags else run
+
+
+def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certificate]) -> Curve:
+    """Where the stage's way stands for the disk's: the part of it that the rig gives way is taken off."""
+    stage = certificates.get("stage")
+    if run.has_laser or stage is None:
+        return curve
+    h = curve.h - stage.compliance * curve.force
+    return replace(curve, h=h, compliance_uncertainty=stage.compliance_uncertainty)
+
+
+def _in_calibrated_range(curve: Curve, certificates: Mapping[str, Certificate]) -> Curve:
+    """The curve with those samples flagged at which a sensor was beyond what it is calibrated for.
+
+    Beyond by more than its noise: a calibration that begins at zero covers an unloaded sensor.
+    """
+    beyond = np.zeros(curve.h.shape, dtype=np.bool_)
+    for role, values in (("force", curve.force), ("hv", curve.voltage)):
+        used = certificates.get(role)
+        if used is not None:
+            margin = NOISE_SIGMAS * used.noise + used.zero_uncertainty
+            beyond |= ~((values >= used.low - margin) & (values <= used.high + margin)) & np.isfinite(values)
+    return replace(curve, flagged=beyond if curve.flagged is None else curve.flagged | beyond)
 
 
 def _at_its_voltage(curve: Curve) -> Curve:
@@ -86,12 +122,24 @@ def _notes(runs: Sequence[Run]) -> list[str]:
     notes = []
     for run in runs:
         log = run.log
+        notes += [f"{log.path}: {problem}" for problem in _certificate_problems(run)]
         if not log.whole:
             notes.append(f"{log.path} is cut short or damaged; `dea-rig info {log.path}` tells what is missing")
         status = (log.outcome or {}).get("status", "unknown")
         if status != "complete":
             notes.append(f"{log.path} is of a run that did not come to its end: {status}")
     return notes
+
+
+def _certificate_problems(run: Run) -> list[str]:
+    """What the run itself noted against the certificates that it used: their dates, another serial number."""
+    noted = run.log.metadata.get("run", {}).get("certificate_problems", "")
+    problems = [problem for problem in noted.split("; ") if problem]
+    for message in run.log.messages("/event"):
+        text = message.fields["message"]
+        if message.fields["severity"] == "warning" and " certificate " in text and text not in problems:
+            problems.append(text)
+    return problems
 
 
 def write_results(found: Found, fit: Path | None, report: Path | None) -> None:

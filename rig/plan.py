@@ -252,6 +252,10 @@ def _actions(numbered: Iterable[tuple[int, steps.Step | Regain]], scene: Scene) 
             if contact:
                 yield Action(number, kind, "back from the film", (h, target), (0, 0), abs(target - h) / speed, speed)
             h, contact = 0.0, False
+        else:
+            from rig.calibrate.plan import actions as calibration_actions
+
+            yield from calibration_actions(number, step, scene, homed=homed, contact=contact)
 
 
 def predict(action: Action, specimen: Specimen, parallel_capacitance: float = 0.0) -> Prediction:

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from rig.calibrate import steps as calibration
 from rig.table import Table
 from rig.toml_file import load_table
 
@@ -102,7 +103,8 @@ class Return(Table):
 
 
 Step = Annotated[
-    Home | Zero | Approach | Precondition | Ramp | Hold | Prompt | Voltage | Sweep | Return, Field(discriminator="do")
+    Home | Zero | Approach | Precondition | Ramp | Hold | Prompt | Voltage | Sweep | Return | calibration.Step,
+    Field(discriminator="do"),
 ]
 
 

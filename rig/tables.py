@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from calibration.homogeneous import TestsFit
     from calibration.result import Identification
     from drivers.discovery import Found as FoundDevice
+    from rig.calibrate.analysis import Calibration
     from rig.experiment import Experiment
     from rig.identification import Found
 
@@ -57,6 +58,56 @@ def plan_table(experiment: Experiment) -> Table:
                 row.append(f"{prediction.minimum_hoop_stress * 1e-3:.0f}")
         table.add_row(*row)
     return table
+
+
+def calibration_table(found: Calibration) -> list[RenderableType]:
+    """What a calibration found, with its budget."""
+    tables: list[RenderableType] = []
+    characteristic = found.characteristic
+    if characteristic is not None:
+        from rig.calibrate.analysis import UNIT
+
+        unit = UNIT[found.quantity]
+        relative = characteristic.gain_uncertainty
+        table = Table(title=f"{found.quantity}: {found.instrument or found.quantity} {found.serial}".strip())
+        table.add_column("what")
+        table.add_column("value", justify="right")
+        table.add_column("uncertainty, k = 1", justify="right")
+        if found.quantity == "compliance":
+            compliance = abs(1e6 / characteristic.gain)
+            table.add_row("compliance of the rig / um/N", f"{compliance:.4g}", f"{compliance * relative:.2g}")
+        else:
+            per = f"{unit} per {found.reading_unit}"
+            table.add_row(f"gain / {per}", f"{characteristic.gain:.7g}", f"{characteristic.gain * relative:.2g}")
+            table.add_row(f"zero / {unit}", f"{characteristic.zero * characteristic.gain:.4g}", "")
+            for name, value in (
+                ("noise of a sample", characteristic.noise),
+                ("zero, with drift", characteristic.zero_uncertainty),
+                ("repeatability", characteristic.repeatability),
+                ("hysteresis", characteristic.hysteresis),
+                ("linearity", characteristic.linearity),
+                *([("creep", found.creep)] if found.creep is not None else []),
+            ):
+                table.add_row(f"{name} / {unit}", f"{value:.2g}", "")
+            top = characteristic.high
+            expanded = f"{characteristic.expanded_uncertainty(top):.2g}"
+            table.add_row(f"expanded uncertainty at {top:.4g} {unit}, k = 2 / {unit}", expanded, "")
+        tables.append(table)
+        budget = Table(title="Budget of the gain")
+        for heading in ("component", "type", "relative, k = 1", "what it is"):
+            budget.add_column(heading)
+        for part in sorted(characteristic.budget, key=lambda part: -part.relative):
+            budget.add_row(part.name, part.type, f"{part.relative:.1e}", part.note)
+        tables.append(budget)
+    if found.lags:
+        lags = Table(title="Lag behind the stage")
+        for heading in ("sensor", "lag / ms", "uncertainty, k = 1 / ms", "hysteresis / um of the stage"):
+            lags.add_column(heading, justify="left" if heading == "sensor" else "right")
+        for role, lag in sorted(found.lags.items()):
+            row = f"{lag.lag * 1e3:.2f}", f"{lag.uncertainty * 1e3:.2f}", f"{lag.standing * 1e6:.2f}"
+            lags.add_row(role, *row)
+        tables.append(lags)
+    return tables
 
 
 def _minutes(seconds: float) -> str:

@@ -21,6 +21,7 @@ from rig.sim.film import Solve, solve_membrane
 from rig.sim.gsv8 import GSV8
 from rig.sim.iseg import IsegEDCP
 from rig.sim.keyence import KeyenceLKG
+from rig.sim.operator import Operator
 from rig.sim.settings import (
     LINK_FAULTS,
     CiA404Truth,
@@ -67,6 +68,8 @@ class SimulatedBench:
         The hidden truth.
     instruments : dict
         By role, for tests and faults.
+    operator : Operator
+        Does by hand what a calibration asks for.
     now : float
         The time up to which everything has happened.
     """
@@ -84,6 +87,7 @@ class SimulatedBench:
             raise ValueError(f"no simulated instrument for {', '.join(sorted(unknown))}; there are {', '.join(ROLES)}")
         self.settings = settings
         self.world = World(settings, specimen, "hv" in roles, solve)
+        self.operator = Operator(self.world, self._rng("operator"))
         self.instruments: dict[str, Instrument] = {}
         self._lines: dict[str, tuple[ByteWire, OnLine]] = {}
         self._buses: dict[str, tuple[FrameWire, OnBus]] = {}

@@ -148,7 +148,7 @@ class CiA404:
             return 0.0
         if self._frozen is not None:
             return self._frozen
-        true = self._world.force_at(t) * (1.0 + s.gain_error) + s.zero_offset_N
+        true = self._world.force_at(t - s.lag_ms * 1e-3) * (1.0 + s.gain_error) + s.zero_offset_N
         return true + s.noise_fraction * s.full_scale_N * self._noise.at(t)
 
     def _measure(self, channel: int, t: float) -> tuple[float, int]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -127,6 +128,7 @@ def _columns(values: Floats) -> list[list[float]]:
     return columns
 
 
+@lru_cache(maxsize=8)  # one bench after another asks for the same film
 def tabulate(specimen: Specimen, compliance: float, with_voltage: bool, solve: Solve = solve_membrane) -> FilmTable:
     """Make the table for ``specimen`` on a rig of ``compliance`` (m/N): s = displacement + compliance x force."""
     reach = REACH * (specimen.ring_radius - specimen.disk_radius)

@@ -111,7 +111,10 @@ class GSV8:
         """What the bridge puts out (mV/V) at time ``t``, without noise."""
         if self._frozen is not None:
             return self._frozen
-        return self._world.force_at(t) * self._mV_per_V_per_N + self._settings.zero_offset_mV_per_V
+        return (
+            self._world.force_at(t - self._settings.lag_ms * 1e-3) * self._mV_per_V_per_N
+            + self._settings.zero_offset_mV_per_V
+        )
 
     def _sample(self, t: float) -> bytes:
         """The frame with the sample of time ``t``."""

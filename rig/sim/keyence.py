@@ -108,7 +108,7 @@ class KeyenceLKG:
         if self._frozen is not None:
             return self._frozen
         s = self._settings
-        middle = max(t - 0.5 * self._window(out), 0.0)
+        middle = max(t - 0.5 * self._window(out) - s.lag_ms * 1e-3, 0.0)
         true = self._world.displacement_at(middle) * 1e3
         fewer = self._averaging[1] if out == 1 else 0
         noise = s.noise_um * 1e-3 * math.sqrt(4.0 ** (s.averaging_code - fewer)) * self._noise.at(t)

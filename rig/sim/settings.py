@@ -131,6 +131,7 @@ class LoadCellTruth(InstrumentTruth):
     gain_error: float = Field(default=0.0, description="hidden relative error of the sensitivity")
     noise_fraction: NonNegative = Field(default=0.005, description="standard deviation of a sample, of full scale")
     clock_drift_ppm: float = 0.0
+    lag_ms: NonNegative = Field(default=0.0, description="by which a sample is older than its time stamp can tell")
     reboot_s: Positive = 1.0
 
 
@@ -192,6 +193,7 @@ class DisplacementTruth(InstrumentTruth):
     averaging_code: Annotated[int, Field(ge=0, le=9)] = Field(default=4, description="4^code samples, as in SW,OC")
     sampling_code: Annotated[int, Field(ge=0, le=5)] = Field(default=1, description="20, 50, 100, 200, 500, 1000 us")
     answer_ms: NonNegative = 1.0
+    lag_ms: NonNegative = Field(default=0.0, description="by which a reading is older than its averaging time tells")
     link: LinkTruth = LinkTruth()
 
 

@@ -59,6 +59,13 @@ class World:
         The film was stretched beyond its reach; the film has arced and conducts from then on.
     extra_leakage : float
         Current drawn beside the film at any voltage (A), for faults.
+    compliance : float
+        Of the rig (m/N).
+    fixture : str
+        What the pusher meets: ``film``; ``target``, a plate on the pusher that the laser sees wherever it goes;
+        ``dummy``, a rigid stop at stage position ``dummy_at`` (m); or ``none``.
+    weight : float
+        Hung on the load cell (N).
     """
 
     def __init__(
@@ -69,7 +76,7 @@ class World:
         self._has_hv = has_hv
         self._solve = solve
         self._contact = settings.contact_position_mm * 1e-3
-        self._compliance = settings.rig_compliance_um_per_N * 1e-6
+        self.compliance = settings.rig_compliance_um_per_N * 1e-6
         self._screw_error = settings.stage.screw_error_um * 1e-6
         self._screw_wave = 2 * math.pi / (settings.stage.screw_pitch_mm * 1e-3)
         self.stage = Path(settings.stage.start_position_mm * 1e-3)
@@ -77,6 +84,9 @@ class World:
         self.torn = False
         self.broken_down = False
         self.extra_leakage = 0.0
+        self.fixture = "film"
+        self.dummy_at = math.inf
+        self.weight = 0.0
         self._table: FilmTable | None = None
         self._branches = [(b.modulus_ratio, b.time_s) for b in settings.film.maxwell]
         self._overstress = [0.0] * len(self._branches)
@@ -89,7 +99,7 @@ class World:
     def film(self) -> FilmTable:
         """The film's table, made when it is first needed."""
         if self._table is None:
-            self._table = tabulate(self.specimen, self._compliance, self._has_hv, self._solve)
+            self._table = tabulate(self.specimen, self.compliance, self._has_hv, self._solve)
         return self._table
 
     # At one time, for instruments
@@ -106,7 +116,15 @@ class World:
         return max(self.carriage_at(t) - self._contact, 0.0)
 
     def force_at(self, t: float) -> float:
-        """Force of the film on the pusher (N), not more than a tick after the last one."""
+        """Force on the load cell (N), not more than a tick after the last one."""
+        match self.fixture:
+            case "film":
+                return self._film_force(t) + self.weight
+            case "dummy":
+                return max(self.carriage_at(t) - self.dummy_at, 0.0) / self.compliance + self.weight
+        return self.weight
+
+    def _film_force(self, t: float) -> float:
         if self.torn:
             return 0.0
         if self._branches:
@@ -125,9 +143,13 @@ class World:
         return self._still_force
 
     def displacement_at(self, t: float) -> float:
-        """Displacement of the disk from its flat position (m)."""
+        """Displacement of the disk, or of the target in its place, from the flat film's position (m)."""
+        if self.fixture == "target":
+            return self.carriage_at(t) - self._contact
+        if self.fixture != "film":
+            return 0.0
         s = self.indentation_at(t)
-        return s if self.torn else s - self._compliance * self._equilibrium(s, t)
+        return s if self.torn else s - self.compliance * self._equilibrium(s, t)
 
     def _equilibrium(self, s: float, t: float) -> float:
         return self.film.force(s, self.output.at(t)[0]) if s > 0 else 0.0
@@ -198,6 +220,8 @@ class World:
         self._check_strength(t)
 
     def _check_strength(self, t: float) -> None:
+        if self.fixture != "film":
+            return
         s = self.indentation_at(t)
         if s > 0 and s > self.film.reach:
             self.torn = True
