@@ -176,7 +176,7 @@ class Bench:
         from rig.sim.wire import FrameWire
 
         wired.prepare()
-        clock = VirtualClock(wired.advance)
+        clock = self._make_clock(wired)
         for role in self.scene.instruments:
             wire = wired.wire(role)
             if isinstance(wire, FrameWire):
@@ -185,6 +185,9 @@ class Bench:
                 self._byte_links[role] = MemoryByteLink(role, wire, clock)
         self.simulated = wired if isinstance(wired, SimulatedBench) else None
         self.clock = clock
+
+    def _make_clock(self, wired: Wired) -> VirtualClock:
+        return VirtualClock(wired.advance)
 
     def attach(self, tap: Tap) -> None:
         """Put the drivers on their links; from here on they may be polled."""

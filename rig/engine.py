@@ -399,7 +399,7 @@ class Engine:
 
     def _turn(self) -> None:
         """One turn of the loop: poll, judge, write, wait."""
-        began = self.clock.now()
+        began = self.recorder.turn = self.clock.now()
         self.control.poll(began)
         if self.control.count:
             raise Stopped(f"stopped by {self.control.source}")

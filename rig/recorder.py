@@ -53,6 +53,7 @@ class Recorder:
         self.contact = math.nan
         self.speed = 0.0  # of the stage, as last asked for
         self.has_laser = has_laser
+        self.turn = 0.0  # when the loop's present turn began
         self.log_failed = False
         self._told_of_space = False
         self.best_effort = False  # on the way to the safe state a log that fails is no reason to stop
@@ -133,8 +134,12 @@ class Recorder:
         return sample
 
     def wire(self, role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:
-        """Write bytes as they were on the wire; ``t`` is the time that the driver was told."""
-        self._write(f"/raw/{role}/{way}", t, data=data)
+        """Write bytes as they were on the wire; ``t`` is the time that the driver was told.
+
+        The time that the message is about is that of the loop's turn: what was read and sent in one turn has it in
+        common.
+        """
+        self._write(f"/raw/{role}/{way}", t, about=self.turn, data=data)
 
     def command(self, device: str, command: str, argument: str, t: float | None = None) -> None:
         """Write a command, called before it is given; or at ``t`` by another process, which tells it first."""
@@ -170,7 +175,7 @@ class Recorder:
 
     def phase(self, fields: Mapping[str, object]) -> None:
         """Write the beginning of an action."""
-        self._write("/phase", self._clock.now(), **fields)
+        self._write("/phase", self._clock.now(), about=None, **fields)
 
     def target(self, displacement: float, voltage: float, speed: float) -> None:
         """Write where the rig is being sent."""
@@ -196,13 +201,14 @@ class Recorder:
         if free < space.LEAST_FREE and not self.best_effort:  # the log itself is sound and can be finished
             raise LogError(self._log.path, left, "The run ended before the disk was full. Free some space.")
 
-    def _write(self, topic: str, t: float, **fields: object) -> None:
+    def _write(self, topic: str, t: float, *, about: float | None = None, **fields: object) -> None:
         """The first error of the log ends the run; after it the way to the safe state goes on unrecorded."""
         if self.log_failed:
             return
         epoch_ns = self._clock.epoch_ns
+        about_ns = epoch_ns(t if about is None else about)
         try:
-            self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), epoch_ns(t))
+            self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), about_ns)
         except LogError:
             self.log_failed = True
             if not self.best_effort:

@@ -60,7 +60,7 @@ class Teardown:
         self._off(cause, at_once=hastened)
         self._stop_stage()
         while self._bench.devices:
-            now = clock.now()
+            now = self._recorder.turn = clock.now()
             self._control.poll(now)
             if commanded and not hastened and (self._control.count >= 2 or "hv" in self._failed or now >= end):
                 hastened, end = True, now + AT_ONCE_S

@@ -24,11 +24,17 @@ _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 class Row(NamedTuple):
-    """One message: its topic, its payload as it lies in the log, its fields."""
+    """One message: its topic, its payload as it lies in the log, its fields, its two times (ns since 1970).
+
+    ``log_ns`` is when it was written. ``about_ns`` is the time that it is about: of bytes, the beginning of the turn of
+    the engine's loop in which they passed; of everything else, `t`.
+    """
 
     topic: str
     payload: bytes
     fields: dict[str, Any]
+    log_ns: int
+    about_ns: int
 
     @property
     def t(self) -> float:
@@ -92,6 +98,12 @@ class Recording:
         phases = [row.fields for row in self.rows if row.topic == "/phase"]
         return [Step(f["t_s"], f"step {f['step']} ({f['kind']}: {f['label']})") for f in phases]
 
+    @cached_property
+    def start_ns(self) -> int:
+        """When the run's clock was at zero, to a nanosecond."""
+        row = next((row for row in self.rows if not row.topic.startswith("/raw/")), self.rows[0])
+        return row.about_ns - round(row.t * 1e9)
+
     def step_at(self, t: float) -> str:
         """What the protocol was doing at time ``t``."""
         return next((step.text for step in reversed(self.steps) if step.t <= t), "the set-up, before the first step")
@@ -147,7 +159,7 @@ def _chunks(log: Log) -> Iterator[list[Row] | None]:
             yield rows
             rows = []
             continue
-        channel, sequence, _, _, payload = message
+        channel, sequence, log_ns, about_ns, payload = message
         topic = channel.topic
         if topic not in schema.CHANNELS:
             continue
@@ -156,6 +168,6 @@ def _chunks(log: Log) -> Iterator[list[Row] | None]:
             return
         expected[topic] = sequence + 1
         try:
-            rows.append(Row(topic, payload, schema.decode(topic, payload)))
+            rows.append(Row(topic, payload, schema.decode(topic, payload), log_ns, about_ns))
         except ValueError as error:
             raise LogError(log.path, str(error), "Another program wrote it, or wrote into it.") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,6 +14,7 @@ from rig.engine import Engine, Outcome
 from rig.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench
 from rig.replay.recording import Recording
+from rig.replay.steering import SteeredBench
 
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
@@ -67,16 +69,27 @@ class Rerun:
         return f"{text}; and the run ends as it did: {self.outcome.status}, {self.outcome.reason}."
 
 
-def rerun(recording: Recording) -> Rerun:
-    """Run the recorded experiment again, answered from its log."""
+def rerun(recording: Recording, *, steered: bool | None = None) -> Rerun:
+    """Run the recorded experiment again, answered from its log.
+
+    ``steered``: whether the clock shows the recorded times turn by turn; by default where the run was in real time.
+    """
+    if steered is None:
+        steered = not recording.in_virtual_time
     experiment = recording.experiment
     operator = _Operator(recording)
     replay = _Again(recording, operator)
-    bench = Bench(experiment.scene, replay)
+    log = _NoLog()
+    bench: Bench
+    if steered:
+        bench = SteeredBench(experiment.scene, replay, recording)
+        log.listener = bench.decided
+    else:
+        bench = Bench(experiment.scene, replay)
     engine = Engine(
         bench,
         experiment.actions,
-        cast("LogWriter", _NoLog()),
+        cast("LogWriter", log),
         gains_of(experiment.certificates),
         operator,
         lambda done, total, label: None,
@@ -158,10 +171,13 @@ class _Again(ReplayBench):
 
 
 class _NoLog:
-    """Takes the place of a log that nobody needs."""
+    """Takes the place of a log that nobody needs; ``listener`` is told every row."""
 
-    def write(self, topic: str, fields: dict[str, Any], log_ns: int, publish_ns: int) -> None:
-        """Nothing is kept."""
+    def __init__(self) -> None:
+        self.listener: Callable[[str, Mapping[str, Any]], None] = lambda topic, fields: None
+
+    def write(self, topic: str, fields: Mapping[str, Any], log_ns: int, publish_ns: int) -> None:
+        self.listener(topic, fields)
 
     def metadata(self, name: str, mapping: dict[str, str]) -> None:
         """Nothing is kept."""
