@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from rig.bench import Bench
-from rig.control import Answer, Control
+from rig.control import Answer, Control, Question
 from rig.engine import Engine, Outcome
 from rig.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 # Of the outcome of a run in real time; its measured values and times come out a little different each time.
 SAME_IN_REAL_TIME = ("status", "safe", "stage_standing")
 AS_RECORDED = "as in the log"
+AT_ONCE_S = 2e-3  # an answer that came so soon was given in the same turn of the loop
 
 
 @dataclass(frozen=True)
@@ -130,32 +131,46 @@ class _Operator(Control):
     """The operator of the recorded run: wants again what he wanted then, at the same instants."""
 
     def __init__(self, recording: Recording) -> None:
-        said = [row.fields for row in recording.rows if row.topic == "/event" and row.fields["source"] == "operator"]
-        given = [row.fields for row in recording.rows if row.topic == "/command"]
-        asked_at = [event["t_s"] for event in said if event["message"].startswith("asked")]
-        answered_at = [event["t_s"] for event in said if event["message"].startswith("answered")]
-        super().__init__(unattended=AS_RECORDED if asked_at == answered_at else "")
-        self.took_down = any((c["device"], c["command"]) == ("hv", "take_down") for c in given)
-        self._wishes = deque((event["t_s"], event["message"].split()[0].rstrip(":")) for event in said)
-        self._stop_at = math.inf
+        super().__init__()
         outcome = recording.log.outcome or {}
+        given = [row.fields for row in recording.rows if row.topic == "/command"]
+        said = [
+            (row.t, row.fields["message"].split()[0].rstrip(":"))
+            for row in recording.rows
+            if row.topic == "/event" and row.fields["source"] == "operator"
+        ]
+        self.took_down = any((c["device"], c["command"]) == ("hv", "take_down") for c in given)
+        self._questions = deque(t for t, word in said if word == "asked")
+        self._answers = deque(t for t, word in said if word == "answered")
+        self._wishes = deque((t, word) for t, word in said if word in ("paused", "continues"))
+        self._answer_at = math.inf
         self._stopped_by = outcome.get("reason", "").removeprefix("stopped by ")
+        self._stop_at = math.inf
         if outcome.get("status") == "stopped":
             # Making safe begins with the stage, in the same turn.
             self._stop_at = max((c["t_s"] for c in given if c["command"] == "stop"), default=math.inf)
 
+    def put(self, question: Question) -> None:
+        super().put(question)
+        asked = self._questions.popleft() if self._questions else 0.0
+        self._answer_at = self._answers.popleft() if self._answers else math.inf
+        if self._answer_at - asked < AT_ONCE_S:
+            self._reply(question)
+
     def at(self, t: float) -> None:
         """What he has wanted by ``t``."""
+        if self.question is not None and self.answer is None and t >= self._answer_at:
+            self._reply(self.question)
         while self._wishes and self._wishes[0][0] <= t:
-            match self._wishes.popleft()[1]:
-                case "paused":
-                    self.ask_pause(AS_RECORDED)
-                case "continues":
-                    self.pausing = ""
-                case "answered" if self.question is not None:
-                    self.answer = self.answer or Answer(self.question.expected, AS_RECORDED)
+            if self._wishes.popleft()[1] == "paused":
+                self.ask_pause(AS_RECORDED)
+            else:
+                self.pausing = ""
         if t >= self._stop_at and not self.count:
             self.ask(self._stopped_by)
+
+    def _reply(self, question: Question) -> None:
+        self.answer = Answer(question.expected, AS_RECORDED)
 
 
 class _Again(ReplayBench):
