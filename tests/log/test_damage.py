@@ -163,31 +163,6 @@ def test_a_damaged_chunk_costs_only_itself(fixture, tmp_path):
     assert log.outcome == {"status": "complete"}
 
 
-def test_power_cuts(tmp_path):
-    """Random subsets of the sectors behind the last sync are there, the rest is zero: nothing wrong comes back."""
-    path = tmp_path / "a.mcap"
-    with LogWriter(path) as writer:
-        for k in range(800):
-            fields = {"t_s": k * 1e-3, "reading": 0.1 * k, "force_N": float(k), "flags": 0}
-            writer.write("/force/sample", fields, k * 10**6, k * 10**6)
-            writer.tick(k * 1e-3)
-        writer.finish({})
-    content = path.read_bytes()
-    truth = contents(read_log(path))
-    rng = random.Random(3)
-    copy = tmp_path / "cut.mcap"
-    for _ in range(60):
-        size = rng.randrange(5000, len(content))
-        state = bytearray(content[:size])
-        for sector in range(4096, size, 512):
-            if rng.random() < 0.4:
-                state[sector : sector + 512] = bytes(len(state[sector : sector + 512]))
-        copy.write_bytes(state + bytes(rng.choice((0, 700, 40_000))))
-        log = read_log(copy)
-        assert not log.whole
-        assert is_part_of(contents(log), truth)
-
-
 # Files made to harm. Each must be read or refused within 2 s and 64 MiB above its size.
 
 
