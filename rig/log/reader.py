@@ -28,6 +28,7 @@ from rig.log.scan import (
     messages,
     rows,
 )
+from rig.log.text import printable
 
 Columns = dict[str, NDArray[Any]]
 
@@ -195,12 +196,14 @@ def _read(source: Source, tables: dict[str, _Table]) -> Log:
                 name, table = scan.metadata(record)
                 _check_new(metadata, name)
                 if name == "log":
-                    _check_version(source.path, table.get("schema_version", ""))
+                    tally.version = table.get("schema_version", "")
                 metadata[name] = table
         except Damaged as why:
             scan.damaged(record, str(why))
-    if not tally.counts.keys() & schema.CHANNELS.keys() and "log" not in metadata:
-        raise LogError(source.path, "holds nothing that dea-rig wrote", "Name a log of dea-rig.")
+    if not tally.counts.keys() & schema.CHANNELS.keys():
+        if "log" not in metadata:
+            raise LogError(source.path, "holds nothing that dea-rig wrote", "Name a log of dea-rig.")
+        tally.check_version()
     return Log(
         path=source.path,
         topics={topic: tally.counts[topic] for topic in schema.CHANNELS if topic in tally.counts},
@@ -224,6 +227,7 @@ class _Tally:
         self.missing: dict[str, int] = {}
         self.start_ns: int | None = None
         self.end_ns = 0
+        self.version = str(schema.SCHEMA_VERSION)  # as the log's metadata claims
         self._path = path
         self._channels: dict[int, ChannelInfo] = {}
         self._checked: set[ChannelInfo] = set()
@@ -252,11 +256,22 @@ class _Tally:
         self.end_ns = max(self.end_ns, last_ns)
         return channels, found
 
+    def check_version(self) -> None:
+        """Refuse a log of another schema version, for which its metadata alone, without checksum, is no proof."""
+        if self.version != str(schema.SCHEMA_VERSION):
+            raise LogError(
+                self._path,
+                f"it was written with schema version {printable(self.version) or '(unknown)'}, and this dea-rig reads "
+                f"version {schema.SCHEMA_VERSION}",
+                "Read it with the version of dea-rig that wrote it; its metadata names it.",
+            )
+
     def _check_schema(self, channel: ChannelInfo) -> None:
         if channel in self._checked or channel.topic not in schema.CHANNELS:
             return
         expected = ("protobuf", schema.schema_name(channel.topic), schema.schema_data(channel.topic))
         if (channel.encoding, channel.schema_name, channel.schema_data) != expected:
+            self.check_version()
             raise LogError(
                 self._path,
                 f"the messages on {channel.topic} are of another kind than those of schema version "
@@ -331,16 +346,6 @@ def _decode(path: Path, topic: str, payload: bytes) -> dict[str, Any]:
         return schema.decode(topic, payload)
     except ValueError as error:
         raise LogError(path, str(error), "Another program wrote it, or wrote into it.") from error
-
-
-def _check_version(path: Path, version: str) -> None:
-    if version != str(schema.SCHEMA_VERSION):
-        raise LogError(
-            path,
-            f"it was written with schema version {version or '(unknown)'}, and this dea-rig reads version "
-            f"{schema.SCHEMA_VERSION}",
-            "Read it with the version of dea-rig that wrote it; its metadata names it.",
-        )
 
 
 def _check_new(found: dict[str, Any], name: str) -> None:
