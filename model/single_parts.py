@@ -78,7 +78,9 @@ class Found:
         """The state as the rest of the model has it."""
         grid = ritz.Grid.lay(self.modes, np.array(self.breaks)[:, None])
         c = np.array(self.c)[:, None]
-        w = np.array([panel.w for panel in self.panels]).reshape(len(self.panels), -1, 1).swapaxes(0, 1)
+        w = np.empty((grid.table.points, len(self.panels), 1))
+        for k, panel in enumerate(self.panels):
+            w[:, k, 0] = panel.w
         if not self.cones:
             return grid, ritz.State(c, w)
 
@@ -91,8 +93,6 @@ class Found:
         which = tuple(fold.number for fold in self.cones)
         folds = cone.Cones(which, points("u"), points("natural"), ends("cos"), ends("sin"), ends("pull"))
         taut = tuple(panel.number for panel in self.panels)
-        if not taut:
-            w = np.empty((grid.table.points, 0, 1))
         return grid, cone.whole(grid, ritz.State(c, w), taut, folds)
 
 

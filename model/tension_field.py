@@ -27,7 +27,7 @@ from model.ritz import Grid, Points, Problem, State
 START_MODES = 5
 MOST_ZONES = 5
 ROUNDS = 4
-SLACK = 3.0  # times the root of the tolerance: share of the largest tension that may have a wrong sign beside a cut
+SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a wrong sign, as it has beside a cut
 CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
 
 
@@ -329,7 +329,7 @@ def _round(
                     answer.grid,
                     answer.state,
                     ritz.evaluate(solved, answer.grid, answer.state),
-                    slack=SLACK * tolerance**0.5,
+                    slack=SLACK * ladder.goal(tolerance),
                 )
                 same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
                 answer.index = where[answer.index]

@@ -56,6 +56,41 @@ def test_independent_formulation(lp: float, h: float, voltage: np.ndarray) -> No
     np.testing.assert_allclose(found.min_meridional_stress, truth.min_meridional_stress, rtol=3e-5)
 
 
+# Folds at disk and ring, at the ring, at the disk, all over.
+FOLDS = [(1.0, 12e-3, 1400.0, 2), (1.0, 4e-3, 900.0, 1), (1.2, 10e-3, 1900.0, 1), (1.0, 12e-3, 1900.0, 0)]
+
+
+@pytest.mark.parametrize(("lp", "h", "v", "cuts"), FOLDS)
+def test_the_path_for_one_state_finds_what_the_path_for_many_does(lp: float, h: float, v: float, cuts: int) -> None:
+    one = solve(film(lp), h, v, tolerance=1e-9, wrinkling="tension_field")
+    assert one.quick is not None
+    many = solve_many(film(lp), [h], v, tolerance=1e-9, wrinkling="tension_field")
+    assert one.status == many.status[0] == Status.WRINKLED
+    assert one.force == pytest.approx(many.force[0], rel=2e-9)
+    for name in ("peak_field", "peak_field_radius", "min_meridional_stress", "max_stretch"):
+        assert getattr(one, name) == pytest.approx(getattr(many, name)[0], rel=1e-6), name
+    assert one.min_hoop_stress == pytest.approx(0.0, abs=1e-5 * one.min_meridional_stress)
+    arrays = solve(film(lp), h, v, tolerance=5e-12, wrinkling="tension_field")
+    assert arrays.quick is None
+    mine, theirs = one.profile(33), arrays.profile(33)
+    assert np.count_nonzero(np.diff(mine.wrinkled)) == cuts
+    np.testing.assert_array_equal(mine.wrinkled, theirs.wrinkled)
+    for name in ("R", "r", "z", "slope", "stretch_1", "stretch_2", "stress_1", "field"):
+        np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), rtol=1e-3, atol=1e-8, err_msg=name)
+
+
+@pytest.mark.parametrize(("lp", "h", "v", "cuts"), FOLDS)
+def test_a_wrinkled_state_costs_no_more_than_six_taut_ones(lp: float, h: float, v: float, cuts: int) -> None:
+    """Counted in points of the law, to an error of the force that is the same, alone and in a batch."""
+    taut = solve(film(1.2), 12e-3, 1500.0, tolerance=1e-6).evaluations.mechanical
+    folded = solve(film(lp), h, v, tolerance=1e-6, wrinkling="tension_field").evaluations
+    assert 0 < folded.relaxed < folded.mechanical < 6 * taut
+    heights = np.linspace(0.99, 1.01, 20)
+    taut = solve_many(film(1.2), heights * 12e-3, 1500.0, tolerance=1e-6).evaluations.mechanical
+    many = solve_many(film(lp), heights * h, v, tolerance=1e-6, wrinkling="tension_field").evaluations
+    assert 0 < many.relaxed < many.mechanical < 7 * taut
+
+
 def test_a_taut_film_pays_for_no_relaxed_energy() -> None:
     h, v = np.linspace(2e-3, 20e-3, 9), np.array([[0.0], [800.0]])
     plain = solve_many(film(1.2), h, v)
