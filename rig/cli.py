@@ -8,11 +8,12 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
+
+from rig.commands.benchmark import benchmark
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -313,63 +314,7 @@ def solve(cases: Path) -> None:
     click.echo(json.dumps(answers, indent=2))
 
 
-@main.group()
-def benchmark() -> None:
-    """Measure: error against run time, stability. Quick by default."""
-
-
-def _benchmark_options(command: Callable[..., None]) -> Callable[..., None]:
-    command = click.option("--full", is_flag=True, help="The whole grid; takes many minutes.")(command)
-    folder = click.Path(path_type=Path, file_okay=False)
-    return click.option("--out", type=folder, default="benchmarks", show_default=True, help="For JSON, CSV, PNG.")(
-        command
-    )
-
-
-@benchmark.command("solver")
-@_benchmark_options
-def benchmark_solver(full: bool, out: Path) -> None:
-    """Error of the membrane solver and of other methods against their run time."""
-    from rig.benchmark import solver
-
-    _benchmark(solver.run, solver.render, "solver", full, out)
-
-
-@benchmark.command("extremes")
-@_benchmark_options
-def benchmark_extremes(full: bool, out: Path) -> None:
-    """The solver in extreme states: statuses, and true error against the error it states."""
-    from rig.benchmark import extremes
-
-    _benchmark(extremes.run, extremes.render, "extremes", full, out)
-
-
-@benchmark.command("rates")
-@_benchmark_options
-def benchmark_rates(full: bool, out: Path) -> None:
-    """Samples lost and processor used with all serial drivers on pseudo-terminals, force at 1 kHz."""
-    from rig.benchmark import rates
-
-    _benchmark(rates.run, rates.render, "rates", full, out)
-
-
-@benchmark.command("safety")
-@_benchmark_options
-def benchmark_safety(full: bool, out: Path) -> None:
-    """How soon the voltage is off when the engine or the guard is killed or hangs, over real processes."""
-    from rig.benchmark import safety
-
-    _benchmark(safety.run, safety.render, "safety", full, out)
-
-
-def _benchmark(run: Callable[..., Any], render: Callable[..., Any], name: str, full: bool, out: Path) -> None:
-    from rig.progress import progress
-    from rig.tables import show
-
-    with progress(f"benchmark {name}") as update:
-        report = run(full, out, lambda share, what: update(share, 1.0, what))
-    show(render(report))
-    click.echo(f"written to {out}/")
+main.add_command(benchmark)
 
 
 @main.command()
