@@ -181,6 +181,7 @@ class _Clock(VirtualClock):
     def __init__(self, steering: Steering, advance: Callable[[float], None]) -> None:
         super().__init__(advance)
         self._steering = steering
+        self.show(steering.next_time(0.0))
 
     def sleep_until(self, t: float) -> None:
         super().sleep_until(self._steering.next_time(t))

@@ -46,6 +46,14 @@ def test_the_run_asks_the_same_again_and_ends_the_same(recorded, name):
         assert found.requests == {role: recording.log.topics[f"/raw/{role}/tx"] for role in found.requests}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", names())
+def test_led_through_the_recorded_turns_the_run_is_the_same(recorded, name):
+    """What a run in real time needs must do no harm to one in virtual time."""
+    found = rerun(recorded(name), steered=True)
+    assert found.exit_code == (0 if whole(name) else 3), found.report
+
+
 @pytest.mark.parametrize("name", names())
 def test_the_run_ended_as_expected(recorded, name):
     log, expected = recorded(name).log, load_fixture(name).expected
