@@ -15,6 +15,7 @@ from rig.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench
 from rig.replay.recording import Recording
 from rig.replay.steering import SteeredBench
+from rig.replay.verify import GUARDED
 
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
@@ -118,6 +119,8 @@ def _departure(replay: ReplayBench, end: float) -> Departure | None:
         first = replay.departures[0]
         return None if incomplete and first.recorded is None else first
     left = {script.due.t: role for role, script in replay.scripts.items() if script.due is not None}
+    if not replay.recording.in_virtual_time:  # a guard in a process of its own polls on until it is dismissed
+        left = {t: role for t, role in left.items() if role != GUARDED}
     return replay.departure(left[min(left)], end, None) if left else None
 
 
