@@ -44,7 +44,8 @@ _ADVICE = {
 _NOWHERE = logging.NullHandler()
 _BUS_OFF = 0x40  # SocketCAN's error class CAN_ERR_BUSOFF in the identifier of an error frame
 _MOST_LOOKS = 4096  # in one read: some 4 s of a full 125 kbit/s bus
-_SEND_TIMEOUT_S = 0.05
+# pyserial takes a process that was kept waiting for the processor for a port that takes no data, although all has gone.
+_SEND_TIMEOUT_S = 0.5
 
 
 class CanLink:
