@@ -24,9 +24,10 @@ from model.membrane import Solutions, Status, Wrinkling
 from model.root import bracketed, enclosed
 
 SAMPLES = 65  # displacements at which the rest is looked for
-CHUNK = 8  # displacements of the path solved together
+CHUNK = 6  # displacements of the path solved together
 STEP = 0.01  # their distance at first, in ring radii ...
-GROWTH = 1.5  # ... and how it grows from one chunk to the next
+GROWTH = 1.2  # ... and how it grows from one to the next
+COARSE = 1e-6  # tolerance on the way to the bracket of the end
 CORRECTIONS = 5  # of a voltage that is nearly right
 ORDER = 16  # of the quadrature of the work
 INSIDE = 1e-5  # error of a peak field inside the film, which a parabola between points finds
@@ -143,7 +144,7 @@ def rests(actuators: Sequence[Actuator], tolerance: float = 1e-9) -> Array:
     """Displacement of the first stable balance without voltage (m), NaN where there is none."""
     spans = np.array([one.span for one in actuators])
     h = np.linspace(spans[:, 0], spans[:, 1], SAMPLES, axis=1)
-    here = balance(actuators, h, np.zeros(h.shape), 1e-8)
+    here = balance(actuators, h, np.zeros(h.shape), 1e-5)
     excess = np.where(here.known, here.excess, np.nan)
     rises = (excess[:, :-1] < 0.0) & (excess[:, 1:] >= 0.0)
     some = np.flatnonzero(rises.any(axis=1))
@@ -231,11 +232,17 @@ class _Way:
     excess: float
     stiffness: float
     reached: float  # displacement looked at last
+    slope: float = 0.0  # of V^2 over displacement, lately
     fold: bool = False
     end: _Point | None = None  # beyond the end
     steepness: float = math.inf  # how fast the criterion's value rises with displacement at the end (1/m)
     limit: Limit | None = None
     snaps: int = 0
+
+    @property
+    def square(self) -> float:
+        """V^2."""
+        return self.voltage**2
 
 
 def strokes(
@@ -274,13 +281,13 @@ def _follow(actuators: list[Actuator], rest: Array, criteria: Criteria, toleranc
         if not c < 0.0:
             way.limit = Limit(int(limit))
     last = np.array([one.span[1] for one in actuators])
+    advance = np.cumsum(GROWTH ** np.arange(CHUNK))
     step = STEP * np.array([one.film.ring_radius for one in actuators])
     while active := [i for i, way in enumerate(ways) if way.limit is None and way.end is None]:
         part = [actuators[i] for i in active]
         reached = np.array([ways[i].reached for i in active])
-        ahead = reached[:, None] + step[active, None] * np.arange(1, CHUNK + 1)
-        ahead = np.minimum(ahead, last[active, None])
-        there, overcome = balancing(part, ahead, tolerance)
+        ahead = np.minimum(reached[:, None] + step[active, None] * advance, last[active, None])
+        there, overcome = balancing(part, ahead, max(tolerance, COARSE), _ahead([ways[i] for i in active], ahead))
         excess, _ = criteria.excess(there.film, there.voltage, _shear(part)[:, None])
         for row, i in enumerate(active):
             way = ways[i]
@@ -297,9 +304,17 @@ def _follow(actuators: list[Actuator], rest: Array, criteria: Criteria, toleranc
                     _advance(way, point, actuators[i], criteria, tolerance)
             if way.end is None and way.limit is None and way.reached >= last[i]:
                 way.limit = Limit.SNAP if way.fold else Limit.RANGE
-        step = GROWTH * step
+        step = GROWTH**CHUNK * step
     _close_in(actuators, ways, criteria, tolerance)
     return ways
+
+
+def _ahead(ways: Sequence[_Way], h: Array) -> Array | None:
+    """A guess of the voltages that balance at ``h`` (ways, ...): V^2 goes on as it has come."""
+    if not all(way.slope > 0.0 for way in ways):
+        return None
+    square, slope, last = (np.array([getattr(way, name) for way in ways])[:, None] for name in ("square", "slope", "h"))
+    return np.asarray(np.sqrt(square + slope * (h - last)))
 
 
 @dataclass
@@ -322,6 +337,8 @@ class _Point:
         if self.excess >= 0.0:
             way.end = self
         else:
+            if self.h > way.h:
+                way.slope = (self.voltage**2 - way.square) / (self.h - way.h)
             way.h, way.voltage, way.excess, way.stiffness = self.h, self.voltage, self.excess, self.stiffness
 
 

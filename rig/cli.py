@@ -318,6 +318,19 @@ main.add_command(benchmark)
 
 
 @main.command()
+@click.argument("study", type=FILE)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="designs", show_default=True)
+@click.option("--workers", type=click.IntRange(1, 256), default=1, show_default=True, help="Processes for maps.")
+@click.option("--dask", metavar="ADDRESS", help="Dask scheduler that carries maps, e.g. tcp://10.0.0.5:8786.")
+@click.option("--compare", is_flag=True, help="Time the paper's shooting method on a sample of a map too.")
+def design(study: Path, out: Path, workers: int, dask: str | None, compare: bool) -> None:
+    """Carry out STUDY (TOML): pictures, CSV, and the paper's claims beside the same computed here."""
+    from rig.commands.design import carry_out
+
+    carry_out(study, out, workers, dask, compare)
+
+
+@main.command()
 @click.option("--port", "ports", multiple=True, help="Ask on this serial port only.")
 @click.option("--bus", "buses", multiple=True, metavar="INTERFACE:CHANNEL[@BITRATE]", help="Ask on this CAN bus only.")
 def devices(ports: tuple[str, ...], buses: tuple[str, ...]) -> None:

@@ -112,6 +112,8 @@ def _shoot(
     root: Any = scipy.optimize.root
 
     def miss(unknowns: Array) -> Array:
+        if not unknowns[0] > 0.0:
+            return np.array([1e3, 1e3])
         try:
             return integrate(float(unknowns[0]), float(unknowns[1]), None)[0]
         except (OutOfDomain, ArithmeticError, ValueError):

@@ -1,0 +1,215 @@
+"""What Cao & Conn 2018 print of their optimisation, beside the same numbers computed here in each treatment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from model.design import Row, Treatment
+
+CASES = {"I": "spring", "II": "mass", "III": "double cone"}
+NAMES = {
+    Treatment.PLAIN.value: "plain equations",
+    Treatment.TENSION.value: "tension kept",
+    Treatment.TENSION_FIELD.value: "tension field",
+}
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A peak over a/b without pre-stretch that the paper prints: section 5 and figure 8. None: not printed."""
+
+    case: str
+    quantity: str  # "stroke" (d*) or "work" (J)
+    value: float | None
+    radius_ratio: float | None
+    times: int = 1  # 2: both cones of the double cone driven in turn
+
+
+PRINTED = (
+    Printed("I", "stroke", 0.061, 0.15),
+    Printed("II", "stroke", None, 0.20),
+    Printed("III", "stroke", 0.128, 0.10),
+    Printed("III", "stroke", 0.256, None, times=2),
+    Printed("I", "work", 0.076e-3, 0.35),
+    Printed("II", "work", 0.129e-3, 0.30),
+    Printed("III", "work", 0.087e-3, 0.20),
+    Printed("III", "work", 0.174e-3, None, times=2),
+)
+BOUND_CLAIMED = 0.3  # claim b: "the optimal a/b ratio is less than 0.3 in all three cases"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One printed peak and ours.
+
+    ``at_printed`` is ours at the a/b of the paper's peak; ``prestretch`` is that of our largest value in the whole map;
+    ``edge``: our peak stands at the edge of the map, and may be beyond it.
+    """
+
+    printed: Printed
+    treatment: str
+    value: float
+    radius_ratio: float
+    at_printed: float | None
+    prestretch: float
+    edge: bool
+
+    @property
+    def deviation(self) -> float | None:
+        """Ours over the paper's, minus one."""
+        return None if self.printed.value is None else self.value / self.printed.value - 1.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a claim holds in a treatment, and the numbers that decide."""
+
+    claim: str
+    treatment: str
+    holds: bool
+    evidence: str
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Everything that the paper says of its optimum, judged.
+
+    ``lost`` counts, by treatment, the states at the end of the stroke in which hoop tension is lost; ``states`` all.
+    """
+
+    compared: list[Compared]
+    verdicts: list[Verdict]
+    contradictions: list[str]
+    states: dict[str, int]
+    lost: dict[str, int]
+
+    def reading(self) -> list[str]:
+        """A few sentences for the reader, made from the numbers."""
+        lines = []
+        for treatment, name in NAMES.items():
+            mine = [v for v in self.verdicts if v.treatment == treatment]
+            if not mine:
+                continue
+            good = ", ".join(v.claim.split(":")[0] for v in mine if v.holds) or "none"
+            bad = "; ".join(f"{v.claim.split(':')[0]} ({v.evidence})" for v in mine if not v.holds) or "none"
+            off = [c.deviation for c in self.compared if c.treatment == treatment and c.deviation is not None]
+            lines.append(
+                f"{name[0].upper()}{name[1:]}: claims that hold: {good}; that fail: {bad}. Our peaks are "
+                f"{min(off):+.0%} to {max(off):+.0%} off the printed ones; hoop tension is lost at the end of "
+                f"{self.lost[treatment]} of {self.states[treatment]} strokes."
+            )
+        return lines + [f"The paper against itself: {text}" for text in self.contradictions]
+
+
+def value(row: Row, quantity: str) -> float:
+    """d* or the work (J) of a row."""
+    return row.normalized_stroke if quantity == "stroke" else row.work
+
+
+def best(rows: Sequence[Row], quantity: str) -> Row:
+    """The row with the largest value; rows without one do not count."""
+    return max(rows, key=lambda row: -math.inf if math.isnan(value(row, quantity)) else value(row, quantity))
+
+
+def judge(rows: Sequence[Row]) -> Claims:
+    """Compare a map, in whatever treatments and pre-stretches it has, with what the paper prints."""
+    treatments = [t for t in NAMES if any(row.treatment == t for row in rows)]
+    compared: list[Compared] = []
+    verdicts: list[Verdict] = []
+    for treatment in treatments:
+        mine = [row for row in rows if row.treatment == treatment]
+        compared += [_compare(mine, printed, treatment) for printed in PRINTED]
+        verdicts += _verdicts(mine, treatment)
+    return Claims(
+        compared=compared,
+        verdicts=verdicts,
+        contradictions=_contradictions(),
+        states={t: sum(row.treatment == t for row in rows) for t in treatments},
+        lost={t: sum(row.treatment == t and row.status == "WRINKLED" for row in rows) for t in treatments},
+    )
+
+
+def _compare(rows: Sequence[Row], printed: Printed, treatment: str) -> Compared:
+    case = [row for row in rows if row.case == printed.case]
+    flat = [row for row in case if row.prestretch == 1.0]
+    top = best(flat, printed.quantity)
+    there = None
+    for row in flat:
+        if printed.radius_ratio is not None and abs(row.radius_ratio - printed.radius_ratio) < 1e-9:
+            there = printed.times * value(row, printed.quantity)
+    return Compared(
+        printed=printed,
+        treatment=treatment,
+        value=printed.times * value(top, printed.quantity),
+        radius_ratio=top.radius_ratio,
+        at_printed=there,
+        prestretch=best(case, printed.quantity).prestretch,
+        edge=top.radius_ratio in (min(r.radius_ratio for r in flat), max(r.radius_ratio for r in flat)),
+    )
+
+
+def _verdicts(rows: Sequence[Row], treatment: str) -> list[Verdict]:
+    by_case = {case: [row for row in rows if row.case == case] for case in CASES}
+    verdicts = []
+
+    def judged(claim: str, holds: bool, evidence: str) -> None:
+        verdicts.append(Verdict(claim, treatment, holds, evidence))
+
+    def tops(quantity: str, show: Callable[[Row], str]) -> str:
+        return ", ".join(f"{case} {show(best(mine, quantity))}" for case, mine in by_case.items())
+
+    if len({row.prestretch for row in rows}) > 1:
+        at = {q: [best(mine, q).prestretch for mine in by_case.values()] for q in ("stroke", "work")}
+        judged(
+            "a: stroke and work are largest without pre-stretch",
+            all(lp == 1.0 for values in at.values() for lp in values),
+            f"largest stroke at pre-stretch {tops('stroke', lambda row: f'{row.prestretch:g}')}; "
+            f"largest work at {tops('work', lambda row: f'{row.prestretch:g}')}",
+        )
+    flat = {case: [row for row in mine if row.prestretch == 1.0] for case, mine in by_case.items()}
+    strokes = [best(mine, "stroke").radius_ratio for mine in flat.values()]
+    works = [best(mine, "work").radius_ratio for mine in flat.values()]
+    where = (
+        f"stroke peaks at a/b {', '.join(f'{c} {x:.2g}' for c, x in zip(CASES, strokes, strict=True))}; "
+        f"work at {', '.join(f'{c} {x:.2g}' for c, x in zip(CASES, works, strict=True))}"
+    )
+    judged(
+        "b (order): stroke peaks at a lower a/b than work",
+        all(s < w for s, w in zip(strokes, works, strict=True)),
+        where,
+    )
+    judged(
+        f"b (bound): every optimal a/b is less than {BOUND_CLAIMED:g}",
+        all(x < BOUND_CLAIMED - 1e-9 for x in (*strokes, *works)),
+        where,
+    )
+    longest = max(CASES, key=lambda case: best(by_case[case], "stroke").stroke)
+    strongest = max(CASES, key=lambda case: best(by_case[case], "work").work)
+    judged(
+        "c (stroke): the double cone has the largest stroke",
+        longest == "III",
+        f"largest d* {tops('stroke', lambda row: f'{row.normalized_stroke:.3f}')}",
+    )
+    judged(
+        "c (work): the mass has the largest work",
+        strongest == "II",
+        f"largest work {tops('work', lambda row: f'{1e3 * row.work:.3f}')} mJ",
+    )
+    judged(
+        "d: no film fails by stretch",
+        not any(row.limit == "STRETCH" for row in rows),
+        f"largest stretch {max(row.max_stretch for row in rows):.2f}",
+    )
+    return verdicts
+
+
+def _contradictions() -> list[str]:
+    """Statements of the paper that its own printed numbers do not bear out."""
+    beyond = [p for p in PRINTED if p.radius_ratio is not None and p.radius_ratio >= BOUND_CLAIMED]
+    return [
+        f"claim b has every optimal a/b below {BOUND_CLAIMED:g}, but section 5 prints the {p.quantity} of "
+        f"case {p.case} with its peak at a/b = {p.radius_ratio:g}."
+        for p in beyond
+    ]
