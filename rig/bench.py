@@ -271,10 +271,10 @@ def arguments(table: Instrument, driver: type[Device]) -> dict[str, Any]:
     return table.model_dump(include=set(signature(driver).parameters))
 
 
-def wired_bench(scene: Scene, *, whole: bool = True) -> SimulatedBench | ReplayBench:
+def wired_bench(scene: Scene, *, real_time: bool = False) -> SimulatedBench | ReplayBench:
     """The bench in memory that a scene names: a log that answers in its place, or the simulated one.
 
-    ``whole`` is for the log: whether each write of the host is one whole request.
+    ``real_time`` is for the log: whether it is served in real time.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def wired_bench(scene: Scene, *, whole: bool = True) -> SimulatedBench | ReplayB
     if now != {role: table.driver for role, table in then.items()}:
         listed = ", ".join(f"{role} {table.driver}" for role, table in then.items())
         raise ConfigError(f"{scene.bench.log} was recorded with other instruments than the scene names: {listed}.")
-    return ReplayBench(recording, whole=whole)
+    return ReplayBench(recording, real_time=real_time)
 
 
 def simulated_bench(scene: Scene) -> SimulatedBench:

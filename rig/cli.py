@@ -225,7 +225,7 @@ def sim(scene: Path) -> None:
     from rig.sim.server import Server
 
     loaded, _ = load_scene(scene)
-    server = Server(wired_bench(loaded, whole=False), RealClock())
+    server = Server(wired_bench(loaded, real_time=True), RealClock())
     with stop_on_signals() as stop:
         try:
             click.echo(json.dumps(server.ports))

@@ -1,7 +1,8 @@
 """A bench that answers from a log: what an instrument once said to a request, it says to the same request again.
 
 Each instrument's answers come as long after its request as they did then. What it sent by itself comes as long after
-the request before it. Requests must come in the order of the log; any other is a `ReplayError`.
+the request before it. Requests must come in the order of the log; any other is a `ReplayError`. In real time a question
+may come once more or less than then: `rig.replay.served` finds its answer.
 """
 
 from __future__ import annotations
@@ -14,20 +15,13 @@ from typing import NamedTuple, NoReturn
 
 from drivers.link import DeviceError
 from rig.replay.recording import Recording
+from rig.replay.served import DIALECTS, Passed, ServedScript
 from rig.scene import CanTable
 from rig.sim.wire import ByteWire, Frame, FrameWire
 
 
 class ReplayError(DeviceError):
     """A request that the log has no answer to, because it is not the one that was made then."""
-
-
-class Passed(NamedTuple):
-    """What passed on a wire at ``t``: sent by the host, or read by it."""
-
-    t: float
-    sent: bool
-    data: bytes
 
 
 class Departure(NamedTuple):
@@ -62,14 +56,13 @@ class Departure(NamedTuple):
 
 
 class _Script:
-    """What passed on one wire, gone through request by request."""
+    """What passed on one wire, gone through request by request. Each write is one whole request."""
 
     def __init__(self, rows: list[Passed], depart: Callable[[float, bytes], NoReturn]) -> None:
         self.requests = 0
-        self._tell = depart
+        self._depart = depart
         self._rest = deque(rows)
         self._coming: deque[tuple[float, bytes]] = deque()
-        self._partial = b""
         self._release(0.0)
 
     @property
@@ -78,25 +71,13 @@ class _Script:
         return self._rest[0] if self._rest else None
 
     def write(self, data: bytes, t: float) -> None:
-        """Take what the host sends, in pieces of any size; raises `ReplayError` where it is not what was sent then."""
-        self._partial += data
-        while self._partial:
-            due = self.due
-            if due is None or not (self._partial.startswith(due.data) or due.data.startswith(self._partial)):
-                self._depart(t)
-            elif len(self._partial) < len(due.data):
-                return
-            else:
-                self._partial = self._partial[len(due.data) :]
-                self._rest.popleft()
-                self.requests += 1
-                self._release(t - due.t)
-
-    def write_whole(self, data: bytes, t: float) -> None:
-        """The same of one whole request."""
-        self.write(data, t)
-        if self._partial:
-            self._depart(t)
+        """Take a request of the host; raises `ReplayError` where it is not what was sent then."""
+        due = self.due
+        if due is None or data != due.data:
+            self._depart(t, data)
+        self._rest.popleft()
+        self.requests += 1
+        self._release(t - due.t)
 
     def read(self, t: float) -> list[bytes]:
         """What has arrived at the host by ``t``, in the pieces in which it was read then."""
@@ -115,21 +96,16 @@ class _Script:
             t, _, data = self._rest.popleft()
             self._coming.append((t + later, data))
 
-    def _depart(self, t: float) -> NoReturn:
-        made, self._partial = self._partial, b""
-        self._tell(t, made)
-
 
 class _ReplayByteWire(ByteWire):
     """A serial line with a log at its far end."""
 
-    def __init__(self, script: _Script, *, whole: bool) -> None:
+    def __init__(self, script: _Script | ServedScript) -> None:
         super().__init__()
         self._script = script
-        self._write = script.write_whole if whole else script.write
 
     def host_write(self, data: bytes, t: float) -> None:
-        self._write(data, t)
+        self._script.write(data, t)
 
     def host_read(self, t: float) -> bytes:
         return b"".join(self._script.read(t))
@@ -142,12 +118,12 @@ class _ReplayByteWire(ByteWire):
 class _ReplayFrameWire(FrameWire):
     """A CAN bus with a log at its far end."""
 
-    def __init__(self, script: _Script, bitrate: int) -> None:
+    def __init__(self, script: _Script | ServedScript, bitrate: int) -> None:
         super().__init__(bitrate=bitrate)
         self._script = script
 
     def host_write(self, frame: Frame, t: float) -> None:
-        self._script.write_whole(frame[0].to_bytes(2, "big") + bytes(frame[1]), t)
+        self._script.write(frame[0].to_bytes(2, "big") + bytes(frame[1]), t)
 
     def host_read(self, t: float) -> list[Frame]:
         return [(int.from_bytes(row[:2], "big"), row[2:]) for row in self._script.read(t)]
@@ -163,8 +139,8 @@ class ReplayBench:
     Parameters
     ----------
     recording : Recording
-    whole : bool
-        Whether every write of the host is one whole request, as in memory; over a port it may come in any pieces.
+    real_time : bool
+        Whether the bench is served in real time.
 
     Attributes
     ----------
@@ -172,11 +148,11 @@ class ReplayBench:
         In the order in which they happened.
     """
 
-    def __init__(self, recording: Recording, *, whole: bool = True) -> None:
+    def __init__(self, recording: Recording, *, real_time: bool = False) -> None:
         self.recording = recording
         self.now = 0.0
         self.departures: list[Departure] = []
-        self.scripts: dict[str, _Script] = {}
+        self.scripts: dict[str, _Script | ServedScript] = {}
         self._wires: dict[str, ByteWire | FrameWire] = {}
         passed: dict[str, list[Passed]] = {}
         for row in recording.rows:
@@ -184,11 +160,13 @@ class ReplayBench:
                 _, _, role, way = row.topic.split("/")
                 passed.setdefault(role, []).append(Passed(row.t, way == "tx", row.fields["data"]))
         for role, table in recording.experiment.scene.instruments.items():
-            script = self.scripts[role] = _Script(passed.get(role, []), partial(self._depart, role))
+            rows, depart = passed.get(role, []), partial(self._depart, role)
+            script = ServedScript(rows, depart, DIALECTS[table.driver]) if real_time else _Script(rows, depart)
+            self.scripts[role] = script
             if isinstance(table, CanTable):
                 self._wires[role] = _ReplayFrameWire(script, table.bitrate)
             else:
-                self._wires[role] = _ReplayByteWire(script, whole=whole)
+                self._wires[role] = _ReplayByteWire(script)
 
     def departure(self, role: str, t: float, made: bytes | None) -> Departure:
         """That ``made`` was sent at ``t`` where the log has something else."""
