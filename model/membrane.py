@@ -14,13 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from model import ritz, single, tension_field, trace
 from model.ladder import FLAT, Answer, Start, climb, first_modes
 from model.law import Array, Evaluations, Film, stack, stress
-from model.profile import Profile, profile
+from model.profile import Profile, dense, profile
 from model.ritz import LONGEST, Grid, Problem, State
 from model.single_parts import Film as OneFilm
 from model.single_parts import Found, slack
 from model.specimen import Specimen
 
 Wrinkling = Literal["plain", "tension_field"]
+Solved = tuple[Problem, Grid, State, Array]  # states, and their force over its unit
 BLOCK = 1024  # states solved together: their arrays stay in the processor's cache
 # Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
 # followed from rest.
@@ -131,7 +132,7 @@ class Solution:
     stretch_exceeded: bool
     dforce: dict[str, Any] | None = None
     evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
-    kept: tuple[Problem, Grid, State, Array] | None = field(default=None, repr=False, compare=False)
+    kept: Solved | None = field(default=None, repr=False, compare=False)
     quick: Found | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -152,22 +153,13 @@ class Solution:
         ValueError : the state has no answer
         """
         kept = self.kept
+        inputs = _Inputs.gather(self.specimen, self.h, self.voltage)
         if self.quick is not None:
-            inputs = _Inputs.gather(self.specimen, self.h, self.voltage)
             problem = _Block(inputs, np.zeros(1, dtype=np.intp), self.evaluations).problem
             kept = problem, *self.quick.arrays(), np.array([self.quick.lam])
         if kept is None:
             raise ValueError(f"no profile: {self.status.message}")
-        s = self.specimen
-        found = profile(
-            *kept,
-            points,
-            ring=s.ring_radius,
-            shear=s.material.shear_modulus,
-            field=abs(self.voltage) / s.thickness,
-        )
-        sign = -1.0 if self.h < 0.0 else 1.0
-        return replace(found, z=sign * found.z, slope=sign * found.slope)
+        return inputs.profile(np.zeros(1, dtype=np.intp), kept, dense(kept[1], points)).of(0)
 
 
 @dataclass
@@ -197,6 +189,19 @@ class _Inputs:
             index = np.arange(len(specimens), dtype=np.intp).reshape(grid.shape)
         which, hh, vv = np.broadcast_arrays(index, h_array, v_array)
         return cls(hh.shape, specimens, which.ravel(), hh.ravel(), vv.ravel())
+
+    def profile(self, index: NDArray[np.intp], solved: Solved, x: Array) -> Profile:
+        """Profiles of the states at ``index`` at places ``x`` (points, S) of ``ln(R/b)``."""
+        films = [self.specimens[i] for i in self.which[index]]
+        found = profile(
+            *solved,
+            x,
+            ring=np.array([film.ring_radius for film in films]),
+            shear=np.array([film.material.shear_modulus for film in films]),
+            field=np.abs(self.voltage[index]) / [film.thickness for film in films],
+        )
+        sign = np.where(self.h[index] < 0.0, -1.0, 1.0)[:, None]
+        return replace(found, z=sign * found.z, slope=sign * found.slope)
 
     def blocks(self) -> Iterator[NDArray[np.intp]]:
         """States to solve together: with or without voltage, of like spans, and as many as stay in the cache."""
@@ -244,6 +249,28 @@ def solve_many(
     Solutions of shape S. A state without an answer has a status that says so and NaN; it never raises.
     """
     return _solve(_Inputs.gather(specimen, h, voltage), tolerance, wrinkling, sensitivities)[0]
+
+
+def profiles(
+    specimen: Specimen | Sequence[Specimen] | NDArray[np.object_],
+    h: ArrayLike,
+    voltage: ArrayLike = 0.0,
+    points: int = 101,
+    *,
+    tolerance: float = 1e-4,
+    wrinkling: Wrinkling = "plain",
+) -> Profile:
+    """The profiles of many states at even steps of ln R, (states, points); NaN where there is no answer.
+
+    Parameters as in `solve_many`; the tolerance, of the force, is for drawing.
+    """
+    inputs = _Inputs.gather(specimen, h, voltage)
+    found = Profile.blank(len(inputs.h), points)
+    share = np.linspace(1.0, 0.0, points)[:, None]
+    with np.errstate(all="ignore"):
+        for index, solved in _solve(inputs, tolerance, wrinkling, False, keep=True)[1]:
+            found.put(index, inputs.profile(index, solved, -share * solved[0].span))
+    return found
 
 
 def _check(tolerance: float, wrinkling: str) -> None:
@@ -302,11 +329,11 @@ def _quick(
 
 
 def _solve(
-    inputs: _Inputs, tolerance: float, wrinkling: Wrinkling, sensitivities: bool
-) -> tuple[Solutions, tuple[Problem, Grid, State, Array] | None]:
-    """The solutions, and the last answer with its problem."""
+    inputs: _Inputs, tolerance: float, wrinkling: Wrinkling, sensitivities: bool, keep: bool = False
+) -> tuple[Solutions, list[tuple[NDArray[np.intp], Solved]]]:
+    """The solutions, and with ``keep`` the states themselves."""
     _check(tolerance, wrinkling)
-    result = _Flat(len(inputs.h), max((len(s.material.mu) for s in inputs.specimens), default=1), sensitivities)
+    result = _Flat(len(inputs.h), max((len(s.material.mu) for s in inputs.specimens), default=1), sensitivities, keep)
     count = Evaluations()
     with np.errstate(all="ignore"):
         for index in inputs.blocks():
@@ -334,7 +361,8 @@ def solve(
         quick = _quick(specimen, float(h), float(voltage), tolerance, folds, near.quick if near else None)
         if quick is not None:
             return quick
-    many, kept = _solve(_Inputs.gather(specimen, float(h), float(voltage)), tolerance, wrinkling, sensitivities)
+    inputs = _Inputs.gather(specimen, float(h), float(voltage))
+    many, kept = _solve(inputs, tolerance, wrinkling, sensitivities, keep=True)
     return Solution(
         specimen=specimen,
         h=float(h),
@@ -356,14 +384,14 @@ def solve(
         if many.dforce is None
         else {k: v if k in ("mu", "alpha") else float(v) for k, v in many.dforce.items()},
         evaluations=many.evaluations,
-        kept=kept,
+        kept=kept[0][1] if kept else None,
     )
 
 
 class _Flat:
     """The results while they are being filled, one entry a state."""
 
-    def __init__(self, states: int, terms: int, sensitivities: bool) -> None:
+    def __init__(self, states: int, terms: int, sensitivities: bool, keep: bool) -> None:
         self.real = {
             name: np.full(states, np.nan)
             for name in (
@@ -382,7 +410,8 @@ class _Flat:
         }
         self.status = np.full(states, Status.INVALID, dtype=np.int8)
         self.dforce: dict[str, Array] | None = None
-        self.kept: tuple[Problem, Grid, State, Array] | None = None
+        self.keep = keep
+        self.kept: list[tuple[NDArray[np.intp], Solved]] = []
         if sensitivities:
             names = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
             self.dforce = {name: np.full(states, np.nan) for name in names}
@@ -541,8 +570,9 @@ class _Block:
                 return
             answer = answer.take(these)
         where = index[answer.index]
-        result.kept = (self.problem.take(where), answer.grid, answer.state, answer.lam)
         to = self.index[where]
+        if result.keep:
+            result.kept.append((to, (self.problem.take(where), answer.grid, answer.state, answer.lam)))
         h, v, t, shear, lp, b = (x[where] for x in (self.h, self.voltage, self.t, self.shear, self.lp, self.b))
         sign = np.sign(h)
         scale = 2.0 * np.pi * b * t * shear / lp**2

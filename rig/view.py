@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from model.shape import meridians
+from model.membrane import profiles
 from rig.clock import RealClock
 from rig.errors import ConfigError, RigError
 from rig.log.dataset import Run, load_run
@@ -294,7 +294,7 @@ def _film(run: Run) -> _Film:
     rows = _film_rows(run)
     if specimen is None or not rows.size:
         return _Film(np.empty(0), nothing, nothing, nothing, "Film (not known)")
-    shape = meridians(specimen, run.h[rows], np.maximum(run.voltage[rows], 0.0), RINGS + 1)
+    shape = profiles(specimen, run.h[rows], np.maximum(run.voltage[rows], 0.0), RINGS + 1)
     taut = np.isfinite(shape.r).all(axis=1)
     shown, unit = (shape.field[taut] * 1e-6, "V/µm") if run.has_hv else (shape.thinning[taut], "times")
     low, high = 0.0 if run.has_hv else 1.0, float(shown.max(initial=1.0))
