@@ -260,7 +260,8 @@ class Engine:
         def event(severity: Severity, message: str) -> None:
             self.recorder.event(severity, "guard", message)
 
-        fresh = {role: age for role, age in allowed_silence(self.bench).items() if role in heartbeat.ROLES}
+        allowed = allowed_silence(self.bench)
+        fresh = {role: allowed[role] + heartbeat.MARGIN_S for role in heartbeat.ROLES if role in allowed}
         if process is not None:
             process.appoint(self.gains.voltage, fresh, tell, event)
             self.guard = process

@@ -16,7 +16,7 @@ import signal
 import sys
 import traceback
 from dataclasses import replace
-from multiprocessing.forkserver import ensure_running
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +32,9 @@ def main(scene: str, protocol: str) -> None:
     experiment = prepare(Path(scene), Path(protocol))
     # The product starts a guard's process afresh each time; here they are forked from one that has read the modules.
     multiprocessing.set_forkserver_preload(["rig.safety.process", "can", "drivers.can_link", "drivers.iseg_edcp"])
-    ensure_running()
+    forkserver.ensure_running()
     importlib.import_module("can")  # the engine reads it while it starts the guard
-    remote.get_context = multiprocessing.get_context("forkserver").get_context  # type: ignore[attr-defined]
+    remote.get_context = lambda method: multiprocessing.get_context("forkserver")  # type: ignore[assignment, attr-defined]
     say("ready")
     serve(experiment)
 
@@ -64,6 +64,7 @@ def serve(experiment: Experiment) -> None:
 
 def bear(experiment: Experiment, wanted: dict[str, Any]) -> None:
     """The life of one engine; never returns."""
+    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign]  # it is our parent's child
     code = 1
     log = Path(wanted["log"])
     os.setsid()

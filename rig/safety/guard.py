@@ -14,7 +14,7 @@ from enum import Enum, Flag
 from typing import TYPE_CHECKING, TypeAlias
 
 from drivers.roles import HVFlag, HVSample, HVSupply
-from rig.errors import FaultError, LimitError
+from rig.errors import FaultError, LimitError, StaleData
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limit, Limits
 
@@ -226,7 +226,7 @@ class Guard:
             if beat.counter != last + 1:
                 raise ValueError(f"it is number {beat.counter} after {last}")
         except ValueError as error:
-            raise self._off(f"the engine's heartbeat cannot be believed: {error}", at_once=True) from None
+            raise self._off(f"the engine's heartbeat cannot be believed: {error}") from None
         self._beat = beat
         self._alive_at = now
 
@@ -236,8 +236,9 @@ class Guard:
         Raises
         ------
         FaultError
-            The engine has been silent for longer than `DEADLINE_S`: off at once. A sensor's newest good sample is too
-            old: ramped down.
+            The engine has been silent for longer than `DEADLINE_S`: off at once.
+        StaleData
+            A sensor's newest good sample is too old: ramped down.
         LimitError
             Field or tension at the measured displacement is outside its limits: off at once.
         """
@@ -258,13 +259,15 @@ class Guard:
             self._alive_at = now
         silent = now - self._alive_at
         if not silent <= DEADLINE_S:
-            raise self._off(f"the engine has been silent for {silent * 1e3:.0f} ms", at_once=True)
+            raise self._off(f"the engine has been silent for {silent * 1e3:.0f} ms")
         if self._beat is None:
             return
         for role, allowed in self._fresh.items():
             age = now - self._beat.samples.get(role, math.nan)
             if not age <= allowed:
-                raise self._off(f"the newest good sample of {role} is {age:.2f} s old", at_once=False)
+                cause = f"the newest good sample of {role} is {age:.2f} s old"
+                self.ramp_off(cause)
+                raise StaleData(f"hv: {cause}; the guard ramps the output down.")
 
     @property
     def _voltage(self) -> float:
@@ -272,12 +275,9 @@ class Guard:
         measured = self.last.voltage if self.last is not None else 0.0
         return max(self.setpoint, measured if measured > 0 else 0.0)
 
-    def _off(self, cause: str, *, at_once: bool) -> FaultError:
-        """Take the output off and give back the error that says so."""
-        if at_once:
-            self.kill(cause)
-        else:
-            self.ramp_off(cause)
+    def _off(self, cause: str) -> FaultError:
+        """Take the output off at once and give back the error that says so."""
+        self.kill(cause)
         return FaultError(f"hv: {cause}; the guard took the output off.")
 
     def on_sample(self, sample: HVSample) -> None:

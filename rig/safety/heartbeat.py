@@ -17,6 +17,8 @@ INTERVAL_S = 0.02  # the engine sends one at most this often
 # The guard takes the output off when it has had none for this long. A hung engine is then answered within 200 ms, and
 # a loop that a loaded computer holds up for 0.1 s is not mistaken for one.
 DEADLINE_S = 0.15
+# The engine judges the age of its data itself; the guard, which sees them later, allows this much more.
+MARGIN_S = 0.25
 
 ROLES = ("stage", "force", "displacement")
 _FORM = struct.Struct("<Q2d3d")  # counter, time of sending, displacement, newest sample of each role

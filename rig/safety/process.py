@@ -240,6 +240,7 @@ class Server:
         self._supply = make_driver(self._table, self._link, self._tell_wire, lambda: self._polled_at)
         limits = Limits.of(self._scene)
         film = FilmLimits(self._scene.specimen.specimen(), limits)
+        film.capacitance(0.0, 0.0)  # the model's first answer takes longest
         fresh = {str(role): float(age) for role, age in message["fresh"].items()}
         self._guard = Guard(self._supply, limits, film, self._table.ramp_V_per_s, self._tell_command, fresh)
 

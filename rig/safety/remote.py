@@ -22,7 +22,7 @@ from drivers.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, HVSupply, Identity, Sample
 from rig.bench import Tap
 from rig.clock import RealClock
-from rig.errors import FaultError, LimitError, RigError
+from rig.errors import FaultError, LimitError, RigError, StaleData
 from rig.recorder import Severity
 from rig.safety import process
 from rig.safety.channel import Channel, ChannelDamaged, Message
@@ -37,6 +37,7 @@ SILENCE_S = 1.0  # ... and one that says nothing for this long: it sends its sta
 OPEN_AGAIN_S = 0.1
 LEAVE_S = 2.0
 
+_ERRORS = {kind.__name__: kind for kind in (LimitError, FaultError, StaleData)}
 _DEVICE_ERRORS = {kind.__name__: kind for kind in (DeviceLost, DeviceSilent, DeviceRefused)}
 
 
@@ -384,4 +385,4 @@ def unpack_error(message: Message) -> Exception:
     kind = message["kind"]
     if kind in _DEVICE_ERRORS or "device" in message:
         return _DEVICE_ERRORS.get(kind, DeviceError)(message["device"], message["what"], message["advice"])
-    return {"LimitError": LimitError, "FaultError": FaultError}.get(kind, RigError)(message["text"])
+    return _ERRORS.get(kind, RigError)(message["text"])

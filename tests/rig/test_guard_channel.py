@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from drivers.link import DeviceLost
-from rig.errors import FaultError, LimitError
+from rig.errors import FaultError, LimitError, StaleData
 from rig.safety import channel
 from rig.safety.channel import Channel, ChannelDamaged
 from rig.safety.process import pack_error
@@ -90,7 +90,13 @@ def test_a_file_descriptor_goes_with_a_message(ends: tuple[Channel, Channel]) ->
 
 @pytest.mark.parametrize(
     "error",
-    [LimitError("too much"), FaultError("broken"), DeviceLost("hv", "it is gone", "Plug it in."), KeyError("x")],
+    [
+        LimitError("too much"),
+        FaultError("broken"),
+        StaleData("old"),
+        DeviceLost("hv", "it is gone", "Plug it in."),
+        KeyError("x"),
+    ],
 )
 def test_errors_come_over_as_what_they_are(error: Exception) -> None:
     there = unpack_error(pack_error(error))

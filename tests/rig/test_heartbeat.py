@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivers.roles import HVFlag, HVSample
-from rig.errors import FaultError, LimitError
+from rig.errors import FaultError, LimitError, StaleData
 from rig.safety.guard import Guard, GuardState
 from rig.safety.heartbeat import DEADLINE_S, INTERVAL_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limits
@@ -143,7 +143,7 @@ def test_every_single_bit_of_a_heartbeat_counts() -> None:
 @pytest.mark.parametrize("newest", [0.0, math.nan])
 def test_a_loop_that_beats_on_old_data_is_ramped_down(rig: Rig, role: str, newest: float) -> None:
     rig.beat(**{role: newest})
-    with pytest.raises(FaultError, match=f"newest good sample of {role}"):
+    with pytest.raises(StaleData, match=f"newest good sample of {role}"):
         rig.guard.turn(rig.now)
     assert rig.supply.words[-1] == "switch_off" and rig.guard.state is GuardState.SAFE
 
