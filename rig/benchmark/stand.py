@@ -81,6 +81,7 @@ class Run:
 
     def __init__(self, stand: Stand, log: Path) -> None:
         self.log = log
+        self._words, self._from = stand.words, stand.words.stat().st_size
         self.engine = self.guard = 0
         self.status: int | None = None
         self.began = stand.bench.clock.now()
@@ -89,7 +90,7 @@ class Run:
     def said(self) -> str:
         """What engine and guard said to the operator."""
         path = self.log.with_suffix(".err")
-        return path.read_text() if path.exists() else ""
+        return (path.read_text() if path.exists() else "") + self._words.read_bytes()[self._from :].decode()
 
     @property
     def beats(self) -> list[float]:
@@ -111,6 +112,8 @@ class Stand:
     def __init__(self, folder: Path, hold_s: float = 1.0) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
+        self.words = folder / "words.txt"  # what guards say
+        self.words.touch()
         self.scene, self.protocol = folder / "scene.toml", folder / "protocol.toml"
         self.scene.write_text(scene_text(), encoding="utf-8")
         self.protocol.write_text(PROTOCOL.replace("HOLD_S", f"{hold_s:g}"), encoding="utf-8")
@@ -124,7 +127,8 @@ class Stand:
         """Start a run, by default after switching the supply off and on; returns once there is an engine."""
         if self._nursery is None:
             command = [sys.executable, "-m", "rig.benchmark.nursery", str(self.scene), str(self.protocol)]
-            self._nursery = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            with self.words.open("ab") as words:
+                self._nursery = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
             while self._line() != "ready":
                 pass
         if power_cycle:
@@ -194,7 +198,7 @@ class Stand:
         if ready:
             data = os.read(self._nursery.stdout.fileno(), 65536)
             if not data:
-                raise RigError("The process that bears engines has ended; its own message stands above.")
+                raise RigError(f"The process that bears engines has ended: {self.words.read_text()[-2000:]}")
             self._buffer += data
 
     def _listen(self, seconds: float) -> None:

@@ -82,7 +82,7 @@ def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
 def test_engine_killed_at_200_random_instants(tmp_path: Path) -> None:
     row = kill_many(tmp_path, 200, at_once=6, seed=1)
     assert len(row.ms) + row.without == 200
-    assert len(row.ms) > 40  # so many had voltage on, or on its way
+    assert len(row.ms) > 30  # so many had voltage on, or on its way
     assert row.never == 0
     assert row.quantile(0.5) < 1e3 * KILLED_S
     assert max(row.ms) < 1e3 * 4 * KILLED_S

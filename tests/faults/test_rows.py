@@ -1,0 +1,233 @@
+"""Index: what can go wrong, row by row, and the tests that hold the required behaviour.
+
+`ROWS` names for each fault what is required of the rig and the tests that show it. Where the row is about processes the
+tests run over real ones, and what they assert is what the simulated supply's own output did.
+"""
+
+from __future__ import annotations
+
+import ast
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).resolve().parents[1]
+
+Row = tuple[str, str, list[str]]
+ROWS: dict[int, Row] = {
+    1: (
+        "the engine is killed",
+        "the guard commands the output off and records that",
+        [
+            "faults/test_processes.py::test_engine_killed",
+            "faults/test_processes.py::test_engine_killed_at_200_random_instants",
+        ],
+    ),
+    2: (
+        "SIGTERM, SIGHUP, Ctrl-C once and often, the terminal gone",
+        "ramped down, at once when hastened; the way to the safe state is never skipped",
+        [
+            "faults/test_terminal.py::test_ctrl_c_ramps_down",
+            "faults/test_terminal.py::test_ctrl_c_twelve_times_hastens_and_skips_nothing",
+            "faults/test_terminal.py::test_the_terminal_is_closed",
+            "faults/test_terminal.py::test_a_signal_from_outside",
+            "faults/test_processes.py::test_guard_ignores_signals_that_end_programs",
+        ],
+    ),
+    3: (
+        "the engine hangs: stopped, or in a loop that never comes back",
+        "the heartbeat's deadline takes the output off",
+        [
+            "faults/test_processes.py::test_engine_hung",
+            "faults/test_processes.py::test_engine_that_was_stopped_and_goes_on_gets_no_voltage_any_more",
+            "rig/test_heartbeat.py::test_a_silent_engine_is_left_no_voltage_after_the_deadline_and_not_before",
+            "rig/test_heartbeat.py::test_a_heartbeat_that_cannot_be_believed_takes_the_output_off_at_once",
+        ],
+    ),
+    4: (
+        "the guard is killed, or hangs",
+        "the engine stops, opens the link itself and commands the output off",
+        [
+            "faults/test_processes.py::test_guard_killed",
+            "faults/test_processes.py::test_guard_that_hangs_is_ended_and_replaced_by_the_engine",
+        ],
+    ),
+    5: (
+        "both are killed; the supply's bus is pulled; the computer is suspended",
+        "the hardware's job, said plainly; NOT SAFE; off after waking up",
+        [
+            "faults/test_processes.py::test_engine_and_guard_killed_leave_the_voltage_to_the_hardware",
+            "faults/test_processes.py::test_a_bus_that_is_pulled_with_voltage_on_ends_the_run_as_not_safe",
+            "faults/test_host.py::test_a_computer_that_was_suspended_with_voltage_on_takes_it_off",
+        ],
+    ),
+    6: (
+        "the supply ignores off",
+        "NOT SAFE, never safe; told again",
+        [
+            "faults/test_processes.py::test_engine_killed_with_a_supply_that_does_not_obey_is_called_not_safe",
+            "faults/test_run_ends_safe.py::test_a_supply_that_ignores_off_is_called_not_safe",
+            "faults/test_run_ends_safe.py::test_a_supply_that_does_not_hear_the_first_off_is_told_again",
+        ],
+    ),
+    7: (
+        "over-current, arc, sag",
+        "off within two samples, latched",
+        [
+            "faults/test_run_ends_safe.py::test_a_breakdown_takes_the_output_off_at_once",
+            "faults/test_other_instruments.py::test_without_a_current_monitor_a_failing_film_shows_in_the_voltage",
+            "faults/test_switches.py::test_ends_safe",
+        ],
+    ),
+    8: (
+        "the field exceeds its limit by motion alone",
+        "refused before voltage or displacement change; off when it is measured",
+        [
+            "rig/test_heartbeat.py::test_a_move_is_asked_for_and_a_voltage_is_held_against_where_it_leads",
+            "rig/test_heartbeat.py::test_a_disk_that_moves_where_the_field_is_too_high_takes_the_output_off",
+            "rig/test_guard.py::test_a_voltage_that_the_flat_film_bears_is_refused_on_the_stretched_one",
+        ],
+    ),
+    9: (
+        "the force exceeds its limit; zeros are taken again and again",
+        "the limit holds against the stored zero",
+        [
+            "faults/test_run_ends_safe.py::test_a_film_stiffer_than_believed_stops_at_the_force_limit",
+            "faults/test_run_ends_safe.py::test_a_sensor_far_off_at_zero_is_refused",
+        ],
+    ),
+    10: (
+        "a sensor is silent, frozen, saturated, without a value",
+        "the stage stops and the voltage goes",
+        [
+            "faults/test_run_ends_safe.py::test_a_device_lost_or_silent_ends_the_run",
+            "faults/test_switches.py::test_ends_safe",
+            "faults/test_other_instruments.py::test_a_load_cell_that_fails_ends_the_run_off",
+            "rig/test_heartbeat.py::test_a_loop_that_beats_on_old_data_is_ramped_down",
+        ],
+    ),
+    11: (
+        "torn, merged, doubled, late replies; alerts between",
+        "dropped and counted, never taken for another's",
+        [
+            "faults/test_switches.py::test_tolerated",
+            "faults/test_matrix.py::test_every_switch_is_met_as_required",
+            "faults/test_other_instruments.py::test_lines_doubled_torn_and_late_change_nothing",
+            "faults/test_other_instruments.py::test_damaged_answers_never_raise_the_voltage",
+        ],
+    ),
+    12: (
+        "a port vanishes at any call",
+        "one kind of error, safe, never armed again by itself",
+        [
+            "drivers/test_serial_link.py::test_every_way_to_vanish_at_every_call",
+            "drivers/test_can_link.py::test_slcan_that_vanishes_is_lost",
+            "faults/test_run_ends_safe.py::test_a_device_lost_or_silent_ends_the_run",
+        ],
+    ),
+    13: (
+        "a device restarts in the middle of a move",
+        "its position is unknown: it is not moved again until homed",
+        [
+            "faults/test_stage_and_laser.py::test_stage_that_restarts_in_the_middle_of_a_move_is_refused_until_homed",
+            "faults/test_switches.py::test_ends_safe",
+        ],
+    ),
+    14: (
+        "a port comes back under another name; instruments are swapped",
+        "known by serial number, else refused",
+        [
+            "faults/test_run_ends_safe.py::test_a_supply_that_vanishes_and_comes_back_is_switched_off",
+            "faults/test_run_ends_safe.py::"
+            "test_an_instrument_with_another_serial_number_is_refused_before_anything_moves",
+        ],
+    ),
+    15: (
+        "the CAN controller goes bus-off; python-can fails in its own way",
+        "the loss of the device; there is no thread that could die unseen",
+        [
+            "drivers/test_can_link.py::test_error_frames_are_counted_and_bus_off_is_a_loss",
+            "drivers/test_can_link.py::test_a_controller_that_has_gone_bus_off_is_a_loss_also_without_an_error_frame",
+            "drivers/test_can_link.py::test_a_backend_that_fails_is_a_loss",
+        ],
+    ),
+    16: (
+        "the calendar is set by an hour",
+        "durations are unaffected, and it is told",
+        ["faults/test_host.py::test_a_calendar_that_is_set_changes_no_duration_and_is_told"],
+    ),
+    17: (
+        "the disk is full, or the log cannot be written",
+        "the run ends safely and the log stays readable",
+        [
+            "faults/test_run_ends_safe.py::test_a_full_disk_ends_the_run_and_leaves_a_readable_log",
+            "faults/test_run_ends_safe.py::test_a_disk_that_is_nearly_full_ends_the_run_with_a_finished_log",
+            "faults/test_run_ends_safe.py::test_a_log_that_fails_on_the_way_to_the_safe_state_stops_nothing",
+        ],
+    ),
+    18: (
+        "the power is cut",
+        "what had been synced is there, and nothing wrong",
+        ["log/test_power_cut.py::test_power_cuts"],
+    ),
+    19: (
+        "a log is truncated, or has flipped bits",
+        "gaps are listed and flips detected",
+        ["log/test_damage.py::test_cut_anywhere", "log/test_damage.py::test_flip_anywhere"],
+    ),
+    20: (
+        "a hostile log or file of settings",
+        "one error of the family, in bounded time and memory; nothing is run",
+        [
+            "log/test_damage.py::test_hostile",
+            "log/test_damage.py::test_names_from_a_log_are_data",
+            "rig/test_config_errors.py::test_a_bad_scene_names_file_key_value_and_what_is_allowed",
+        ],
+    ),
+    21: (
+        "a certificate is out of date, or another instrument's",
+        "told in the log, or refused",
+        [
+            "calibration/test_certificate.py::test_expired_not_yet_valid_and_mismatched",
+            "faults/test_run_ends_safe.py::test_a_certificate_of_another_sensor_is_told_in_the_log",
+        ],
+    ),
+    22: (
+        "a second run, or another program, on the same port",
+        "refused; the first one is not disturbed",
+        [
+            "faults/test_processes.py::test_a_second_run_on_the_same_ports_is_refused_and_disturbs_nothing",
+            "drivers/test_serial_link.py::test_lock_of_another_process_holds_until_it_is_killed",
+        ],
+    ),
+    23: (
+        "the supply is found live at the start",
+        "reported, nothing changed, a ramp down offered",
+        [
+            "faults/test_run_ends_safe.py::test_a_supply_found_live_is_reported_and_left_alone",
+            "faults/test_run_control.py::test_a_supply_found_live_is_taken_down_when_the_operator_chooses",
+            "faults/test_run_control.py::"
+            "test_a_supply_found_live_is_left_alone_while_the_operator_thinks_and_when_he_stops",
+        ],
+    ),
+}
+
+
+@cache
+def names_in(path: str) -> frozenset[str]:
+    tree = ast.parse((TESTS / path).read_text(encoding="utf-8"))
+    return frozenset(node.name for node in tree.body if isinstance(node, ast.FunctionDef))
+
+
+def test_there_are_23_rows() -> None:
+    assert sorted(ROWS) == list(range(1, 24))
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row}: {ROWS[row][0]}")
+def test_every_row_has_its_tests(row: int) -> None:
+    _, required, names = ROWS[row]
+    assert required and names
+    for name in names:
+        path, _, function = name.partition("::")
+        assert function in names_in(path), f"row {row}: there is no {name}"
