@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.certificate import Certificate, CertificateError, parse_certificate
+from calibration.certificate import Certificate, CertificateError
 from calibration.curve import Curve, CurveError
 from calibration.homogeneous import TestsError, TestsFit, fit_tests, load_test
 from calibration.identify import IdentificationError, identify
@@ -52,7 +52,7 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
     LogError, DataError
         When a log cannot be read, lacks what is needed, or the curves cannot be fitted.
     """
-    runs = [_load(path) for path in paths]
+    runs = [load_run(path) for path in paths]
     scenes = [parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)") for run in runs]
     hashes = {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
     provenance: dict[str, object] = {
@@ -64,7 +64,7 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
     curves: list[Curve] = []
     try:
         for run, scene in zip(runs, scenes, strict=True):
-            certificates = _certificates(run)
+            certificates = run.certificates
             found = run.curves(scene.specimen.specimen(), **_errors(run, scene, certificates))
             corrected = [_without_compliance(curve, run, certificates) for curve in found]
             inside = [_in_calibrated_range(_at_its_voltage(curve), certificates) for curve in corrected]
@@ -75,16 +75,6 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
     except (CurveError, IdentificationError, CertificateError) as error:
         raise DataError(f"{error}.") from None
     return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs))
-
-
-def _load(path: Path) -> Run:
-    """The run with what its sensors lag behind, by their certificates, taken off the time stamps."""
-    run = load_run(path)
-    try:
-        lags = {role: one.lag for role, one in _certificates(run).items() if one.lag}
-    except CertificateError as error:
-        raise DataError(f"{error}.") from None
-    return load_run(path, lags) if lags else run
 
 
 def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certificate]) -> Curve:
@@ -230,15 +220,6 @@ def _errors(run: Run, scene: Scene, certificates: Mapping[str, Certificate]) -> 
     if hv is not None:
         errors["voltage_gain"] = hv.gain_uncertainty
     return errors
-
-
-def _certificates(run: Run) -> dict[str, Certificate]:
-    found: dict[str, Certificate] = {}
-    for name, attachment in run.log.attachments.items():
-        if name.startswith("certificate."):
-            certificate = parse_certificate(attachment.data, f"{run.log.path} ({name} inside)")
-            found[certificate.role] = certificate
-    return found
 
 
 def _truth(runs: Sequence[Run], scenes: Sequence[Scene]) -> Material | None:

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from rig.log.errors import LogError
 from rig.log.reader import Columns, Log, read_tables
+from rig.log.text import printable
 
 if TYPE_CHECKING:
+    from calibration.certificate import Certificate
     from calibration.curve import Curve
     from model.specimen import Specimen
 
@@ -119,6 +121,11 @@ class Run:
         """The text of the protocol file."""
         return self._text("protocol.toml")
 
+    @property
+    def certificates(self) -> dict[str, Certificate]:
+        """The certificates of the sensors in use, by role."""
+        return _certificates(self.log)
+
     def reference(self, name: str, t: float = np.inf) -> Reference | None:
         """The newest reference of that name taken before ``t``."""
         found = [reference for reference in self.references if reference.name == name and reference.t <= t]
@@ -190,17 +197,19 @@ def load_run(path: Path, latency: Mapping[str, float] | None = None) -> Run:
     ----------
     latency : mapping of str to float, optional
         Seconds by which the time stamps of a role ("force", "displacement", "stage", "hv") come late, as measured;
-        they are taken off.
+        they are taken off. By default what the certificates in the log say; {} leaves the times as recorded.
 
     Raises
     ------
     rig.log.errors.LogError
-        The log cannot be read, or holds no force samples.
+        The log cannot be read, holds no force samples, or a certificate that is none.
     """
     log, tables = read_tables(path, (*_TOPICS, "/phase", "/reference"))
     if "/force/sample" not in log.topics:
         raise LogError(path, "holds no force samples", "There is nothing to align.")
-    late = dict(latency or {})
+    if latency is None:
+        latency = {role: certificate.lag for role, certificate in _certificates(log).items()}
+    late = {role: seconds for role, seconds in latency.items() if seconds}
     times = {topic: tables[topic]["t_s"] - late.pop(topic.split("/")[1], 0.0) for topic in _TOPICS}
     if late:
         raise ValueError(f"latency of {', '.join(late)}; roles are force, displacement, stage, hv")
@@ -237,6 +246,20 @@ def _without_interrupted(phases: list[Phase]) -> list[Phase]:
         phase._replace(record=False) if follower == "pause" else phase
         for phase, follower in zip(phases, followers, strict=False)
     ]
+
+
+def _certificates(log: Log) -> dict[str, Certificate]:
+    found: dict[str, Certificate] = {}
+    for name, attachment in log.attachments.items():
+        if name.startswith("certificate."):
+            from calibration.certificate import CertificateError, parse_certificate
+
+            try:
+                certificate = parse_certificate(attachment.data, f"{printable(name)} inside")
+            except CertificateError as error:
+                raise LogError(log.path, f"holds a certificate that cannot be used: {error}") from None
+            found[certificate.role] = certificate
+    return found
 
 
 def interpolate(t: Floats, sample_t: Floats, values: Floats) -> Floats:

@@ -1,4 +1,5 @@
 import math
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,9 @@ def truth_force(t):
     return 30.0 * truth_h(t)
 
 
-def write_run(path: Path, *, laser: bool = True, hv: bool = True, lost=(), flagged=(), zero_at: float = 0.5) -> None:
+def write_run(
+    path: Path, *, laser: bool = True, hv: bool = True, lost=(), flagged=(), zero_at: float = 0.5, certificate=b""
+) -> None:
     """A ramp up and down at 1000 V: force at 100 Hz, laser and stage at 50 Hz, supply at 10 Hz.
 
     ``lost`` and ``flagged`` are intervals without, and with flagged, displacement samples.
@@ -35,6 +38,8 @@ def write_run(path: Path, *, laser: bool = True, hv: bool = True, lost=(), flagg
             log.write(topic, {"t_s": t, **fields}, ns, ns)
 
         log.attach("scene.toml", "application/toml", b"[specimen]\n")
+        if certificate:
+            log.attach("certificate.displacement.toml", "application/toml", certificate)
         phases = {
             0: (0, "zero", 0, False),
             100: (1, "sweep", 1, True),
@@ -103,6 +108,21 @@ def test_latency_is_taken_off(tmp_path):
     np.testing.assert_allclose(run.h[rows], truth_h(run.t[rows] + 0.1), atol=1e-15)
     with pytest.raises(ValueError, match="lasser"):
         load_run(tmp_path / "a.mcap", latency={"lasser": 0.1})
+
+
+def test_lags_of_the_certificates_in_the_log_are_taken_off(tmp_path):
+    text = (Path(str(files("sim_fixtures"))) / "calibrations" / "displacement.toml").read_text()
+    certificate = text.replace('role = "displacement"', 'role = "displacement"\nlag_s = 0.1')
+    assert certificate != text
+    write_run(tmp_path / "a.mcap", certificate=certificate.encode())
+    for latency, seconds in ((None, 0.1), ({}, 0.0), ({"displacement": 0.2}, 0.2)):
+        run = load_run(tmp_path / "a.mcap", latency)
+        rows = (run.t > 1.0) & (run.t < 2.7)
+        np.testing.assert_allclose(run.h[rows], truth_h(run.t[rows] + seconds), atol=1e-15)
+    assert run.certificates["displacement"].lag == 0.1
+    write_run(tmp_path / "b.mcap", certificate=b"lag_s = 'soon'")
+    with pytest.raises(LogError, match=r"a certificate that cannot be used: certificate\.displacement\.toml inside"):
+        load_run(tmp_path / "b.mcap")
 
 
 def test_curves(tmp_path):
