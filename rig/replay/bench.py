@@ -15,7 +15,7 @@ from typing import NamedTuple, NoReturn
 
 from drivers.link import DeviceError
 from rig.replay.recording import Recording
-from rig.replay.served import DIALECTS, Passed, ServedScript
+from rig.replay.served import DIALECTS, Lag, Passed, ServedScript
 from rig.scene import CanTable
 from rig.sim.wire import ByteWire, Frame, FrameWire
 
@@ -155,13 +155,14 @@ class ReplayBench:
         self.scripts: dict[str, _Script | ServedScript] = {}
         self._wires: dict[str, ByteWire | FrameWire] = {}
         passed: dict[str, list[Passed]] = {}
+        lag = Lag()
         for row in recording.rows:
             if row.topic.startswith("/raw/"):
                 _, _, role, way = row.topic.split("/")
                 passed.setdefault(role, []).append(Passed(row.t, way == "tx", row.fields["data"]))
         for role, table in recording.experiment.scene.instruments.items():
             rows, depart = passed.get(role, []), partial(self._depart, role)
-            script = ServedScript(rows, depart, DIALECTS[table.driver]) if real_time else _Script(rows, depart)
+            script = ServedScript(rows, depart, DIALECTS[table.driver], lag) if real_time else _Script(rows, depart)
             self.scripts[role] = script
             if isinstance(table, CanTable):
                 self._wires[role] = _ReplayFrameWire(script, table.bitrate)

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import NamedTuple, NoReturn
 
 REPEATED = 20  # a request that stands so often in a log is a question that is asked all the time
+ANSWER_S = 0.5  # what comes later after a request comes by itself
 
 _ZABER = re.compile(rb"/(\d+ \d+) (\d+) ?([^:\n]*)(?::[0-9A-F]{2})?\r?\n")
 _ZABER_REPLY = re.compile(rb"@(\d+ \d+) (\d+)([^:\r\n]*)(:[0-9A-F]{2})?\r\n")
@@ -105,14 +106,25 @@ DIALECTS: dict[str, Dialect] = {
 }
 
 
+class Lag:
+    """By how much this run is behind the recorded one: one for all instruments, so that what they say fits together."""
+
+    def __init__(self) -> None:
+        self.s = 0.0
+
+
 class ServedScript:
     """What passed on one wire, found by request."""
 
-    def __init__(self, rows: list[Passed], depart: Callable[[float, bytes], NoReturn], dialect: Dialect) -> None:
+    def __init__(
+        self, rows: list[Passed], depart: Callable[[float, bytes], NoReturn], dialect: Dialect, lag: Lag
+    ) -> None:
         self.requests = 0
+        self._lag = lag
         self._depart = depart
         self._dialect = dialect
-        self._coming: deque[tuple[float, bytes]] = deque()
+        self._coming: deque[tuple[float, bytes]] = deque()  # by the time of this run
+        self._stream: deque[tuple[float, bytes]] = deque()  # by the recorded time: what comes by itself
         self._exchanges: list[Exchange] = []
         answers: list[tuple[float, bytes]] = []
         for n, row in enumerate(rows):
@@ -121,12 +133,11 @@ class ServedScript:
                 answers = [(late.t - row.t, late.data) for late in rows[n + 1 : after]]
                 self._exchanges.append(Exchange(row, dialect.key(row.data), tuple(answers)))
             elif not self._exchanges:
-                self._coming.append((row.t, row.data))
+                self._stream.append((row.t, row.data))
         counts = Counter(exchange.key for exchange in self._exchanges)
         self._repeated = {key for key, count in counts.items() if count >= REPEATED}
         self._newest: dict[bytes, Exchange] = {}
         self._next = 0
-        self._later = 0.0  # by how much this run is behind the recorded one
         self._partial = b""
 
     @property
@@ -148,11 +159,14 @@ class ServedScript:
         arrived = []
         while self._coming and self._coming[0][0] <= t:
             arrived.append(self._coming.popleft()[1])
+        while self._stream and self._stream[0][0] + self._lag.s <= t:
+            arrived.append(self._stream.popleft()[1])
         return arrived
 
     @property
     def next_arrival(self) -> float:
-        return self._coming[0][0] if self._coming else math.inf
+        coming = self._coming[0][0] if self._coming else math.inf
+        return min(coming, self._stream[0][0] + self._lag.s if self._stream else math.inf)
 
     def _answer(self, request: bytes, t: float) -> None:
         key = self._dialect.key(request)
@@ -162,8 +176,10 @@ class ServedScript:
         self._newest[key] = found
         self.requests += 1
         for delay, data in self._dialect.anew(found, request):
-            self._coming.append((t + delay, data))
-        self._coming = deque(sorted(self._coming, key=lambda arrival: arrival[0]))
+            if delay <= ANSWER_S:
+                self._coming.append((t + delay, data))
+            elif key not in self._repeated:
+                self._stream.append((found.request.t + delay, data))
 
     def _coming_up(self, key: bytes, t: float) -> Exchange | None:
         """The next exchange that cannot be left out, if it is this one; time goes on from there."""
@@ -171,7 +187,7 @@ class ServedScript:
             exchange = self._exchanges[n]
             if exchange.key == key:
                 self._next = n + 1
-                self._later = t - exchange.request.t
+                self._lag.s = t - exchange.request.t
                 return exchange
             if exchange.key not in self._repeated:
                 break
@@ -179,7 +195,7 @@ class ServedScript:
 
     def _nearest(self, key: bytes, t: float) -> Exchange | None:
         """Of the exchanges up to the next that cannot be left out, and the newest, that which is nearest in time."""
-        then = t - self._later
+        then = t - self._lag.s
         best, best_n = self._newest.get(key), self._next
         for n in range(self._next, len(self._exchanges)):
             exchange = self._exchanges[n]
