@@ -73,3 +73,45 @@ def test_the_run_asks_the_same_again_and_ends_the_same(real):
     assert found.outcome.status == "complete" and found.outcome.safe
     for role in ("stage", "force"):  # the guard polls on until it is dismissed
         assert found.requests[role] == real.log.topics[f"/raw/{role}/tx"]
+
+
+def on_its_log(name, folder):
+    """The scene of a fixture with its log in place of the simulation, for ports."""
+    fixture = LOGS / name
+    text = (fixture / "scene.toml").read_text().split("# The truth.")[0].replace('"../', f'"{fixture}/../')
+    for driver in (*DRIVERS, "keyence-lkg"):
+        text = text.replace(f'driver = "{driver}"', f'driver = "{driver}"\ntimeout_s = 2.0')
+    scene = folder / "scene.toml"
+    scene.write_text(f'{text}\n[bench]\nbackend = "replay"\nlog = "{fixture}/log.mcap"\n')
+    return scene
+
+
+def test_a_log_served_on_ports_stands_in_for_the_bench(tmp_path):
+    """The whole run, in real time, on what the instruments said then."""
+    scene, log = on_its_log("no-hv", tmp_path), tmp_path / "run.mcap"
+    with served(scene, tmp_path) as ports:
+        run = dea_rig("run", scene, LOGS / "no-hv" / "protocol.toml", "-o", log, "--ports", ports)
+        _, errors = run.communicate(timeout=200)
+    assert run.returncode == 0, errors
+    then, now = load_recording(LOGS / "no-hv" / "log.mcap").log, load_recording(log).log
+    assert set(now.columns("/force/sample")["reading"]) <= set(then.columns("/force/sample")["reading"])
+    assert set(now.columns("/stage/sample")["raw_steps"]) <= set(then.columns("/stage/sample")["raw_steps"])
+    assert now.topics["/force/sample"] == pytest.approx(then.topics["/force/sample"], rel=0.2)
+    references = [{m.fields["name"]: m.fields["value"] for m in one.messages("/reference")} for one in (then, now)]
+    assert references[1]["contact_position"] == pytest.approx(references[0]["contact_position"], abs=5e-6)
+
+
+def test_another_protocol_on_a_served_log_is_told_at_the_server(tmp_path):
+    scene, protocol, log = on_its_log("no-hv", tmp_path), tmp_path / "protocol.toml", tmp_path / "run.mcap"
+    text = (LOGS / "no-hv" / "protocol.toml").read_text()
+    protocol.write_text(text.replace("speed_mm_per_s = 2.0", "speed_mm_per_s = 3.0"))  # of the approach
+    with dea_rig("sim", scene) as bench:
+        ports = tmp_path / "ports.json"
+        ports.write_text(bench.stdout.readline())
+        run = dea_rig("run", scene, protocol, "-o", log, "--ports", ports)
+        _, errors = run.communicate(timeout=200)
+        _, told = bench.communicate(timeout=30)
+    assert run.returncode == 4 and "stage" in errors
+    assert bench.returncode == 4
+    assert "is not the recorded one" in told and "in step 3 (approach: advance to contact)" in told
+    assert b"set maxspeed".hex(" ") in told.split("recorded ")[2] and b"set maxspeed".hex(" ") in told.split("made ")[1]
