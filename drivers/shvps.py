@@ -66,19 +66,26 @@ def identity(name: str, version: str) -> Identity:
 
 
 class Codec:
-    """Bytes to lines of printable ASCII. ``counters``: ``bad_grammar``, ``too_long``."""
+    """Bytes to lines of printable ASCII. ``counters``: ``bad_grammar``, ``too_long``.
+
+    What follows a line that ended without CR is dropped as well: it may be the rest of a number that was torn in two.
+    """
 
     def __init__(self, counters: dict[str, int] | None = None) -> None:
         self.counters = {} if counters is None else counters
         self.counters.setdefault("bad_grammar", 0)
         self._lines = LineSplitter(b"\n", _MAX_LINE, self.counters)
+        self._torn = False
 
     def feed(self, data: bytes) -> list[str]:
         """The lines that ``data`` completes, in order."""
-        complete = self._lines.feed(data)
-        lines = [line[:-1].decode("ascii") for line in complete if _LINE.fullmatch(line)]
-        self.counters["bad_grammar"] += len(complete) - len(lines)
-        return lines
+        return [line[:-1].decode("ascii") for line in self._lines.feed(data) if self._is_good(line)]
+
+    def _is_good(self, line: bytes) -> bool:
+        good = not self._torn and _LINE.fullmatch(line) is not None
+        self._torn = not line.endswith(b"\r")
+        self.counters["bad_grammar"] += not good
+        return good
 
 
 class Shvps:

@@ -180,10 +180,10 @@ class Codec:
     def _line(self, line: bytes) -> Message | None:
         if not line:
             return None
-        if any(not 0x20 <= byte <= 0x7E for byte in line):
+        text = line.decode("ascii", "replace")
+        if not (text.isascii() and text.isprintable()):
             self.counters["bad_grammar"] += 1
             return None
-        text = line.decode("ascii")
         kind, body = text[0], text[1:]
         checked = _CHECKSUMMED.fullmatch(body)
         if checked:
