@@ -230,6 +230,11 @@ class Guard:
         self._beat = beat
         self._alive_at = now
 
+    def excuse(self, seconds: float) -> None:
+        """The engine could not beat for so long, because it waited for the guard's own answer."""
+        if self._alive_at is not None:
+            self._alive_at += seconds
+
     def turn(self, now: float) -> None:
         """Judge what only shows over time: the engine's life, the age of its data, the film as measured.
 

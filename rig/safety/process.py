@@ -246,7 +246,7 @@ class Server:
 
     def _answer(self, message: Message) -> None:
         guard, supply = self._guard, self._supply
-        name, error = message["name"], None
+        name, error, began = message["name"], None, self._clock.now()
         try:
             if guard is None or supply is None:
                 raise FaultError("hv: the guard was asked before it was appointed.")
@@ -258,6 +258,7 @@ class Server:
         except Exception as caught:
             error = pack_error(caught)
         if guard is not None and supply is not None:
+            guard.excuse(self._clock.now() - began)
             self._tell_state(guard, supply, self._clock.now())
         self._channel.send({"is": "answer", "n": message["n"], "error": error})
 

@@ -139,3 +139,14 @@ def test_a_signal_from_outside(terminal: Terminal, number: signal.Signals) -> No
     log = terminal.end()
     check_off(terminal, at, log)
     assert terminal.process.returncode == 130 and words(log)[-1] == "switch_off"
+
+
+def test_the_run_is_killed(terminal: Terminal) -> None:
+    """As in `test_processes`, with everything as the command line starts it."""
+    stand = terminal.stand
+    at = stand.bench.clock.now()
+    terminal.process.kill()
+    terminal.wait(lambda: stand.off_after(at) is not None, "the output's end")
+    terminal.wait(lambda: b"The high voltage is off, measured" in terminal.shown, "the guard's word")
+    assert stand.bench.voltage() < 60.0
+    assert words(read_log(terminal.log.with_name("run.mcap.part")))[-1] == "emergency_off"

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from importlib.resources import files
 from pathlib import Path
+
+import pytest
+
+from rig.bench import simulated_bench
+from rig.scene import load_scene
+from rig.sim.served import ServedBench
+
+FIXTURES = Path(str(files("sim_fixtures")))
 
 HEAVY = ("scipy", "lmfit", "matplotlib", "rerun", "can", "serial", "numpy", "pydantic", "google.protobuf", "mcap")
 
@@ -41,3 +51,32 @@ def test_checking_a_scene_without_hv_opens_no_door_to_hardware_or_fitting() -> N
         "f = Path('sim_fixtures')\nprepare(f / 'scenes/no-hv.toml', f / 'protocols/passive.toml')"
     )
     assert imported_by(code) & {"can", "serial", "lmfit", "matplotlib", "rerun"} == set()
+
+
+def test_checking_a_scene_with_hv_starts_no_guard_and_opens_no_bus() -> None:
+    code = (
+        "from pathlib import Path\nfrom rig.experiment import prepare\n"
+        "f = Path('sim_fixtures')\nprepare(f / 'scenes/cone-4mm.toml', f / 'protocols/short.toml')\n"
+        "assert not {'multiprocessing', 'rig.safety.remote', 'rig.safety.process'} & set(sys.modules)"
+    )
+    assert imported_by(code) & {"can", "serial"} == set()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
+def test_a_run_without_hv_on_real_ports_starts_no_guard_and_imports_no_can() -> None:
+    scene, _ = load_scene(FIXTURES / "scenes" / "no-hv.toml")
+    with ServedBench(simulated_bench(scene)) as served:
+        code = (
+            "from pathlib import Path\nfrom rig.scene import load_scene\nfrom rig.bench import Bench\n"
+            f"scene = load_scene(Path({str(FIXTURES / 'scenes' / 'no-hv.toml')!r}))[0]\n"
+            f"bench = Bench(scene.with_ports({dict(served.ports)!r}))\n"
+            "bench.attach(lambda role, way, data, t: None)\n"
+            "while not all(device.ready for device in bench.devices.values()):\n"
+            "    for role in bench.devices: bench.poll(role, bench.clock.now())\n"
+            "    bench.clock.sleep_until(bench.clock.now() + 0.002)\n"
+            "bench.close()\n"
+            "assert bench.guard_process is None\n"
+            "assert not {'multiprocessing', 'rig.safety.remote', 'rig.safety.process'} & set(sys.modules)"
+        )
+        found = imported_by(code)
+    assert "serial" in found and "can" not in found
