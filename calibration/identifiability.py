@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.curve import Curve
 from calibration.problem import IdentificationError, Problem
-from calibration.propagation import state
+from calibration.propagation import Statement, state
 from calibration.reduction import select
 from calibration.result import WEAKLY_IDENTIFIED, Quantity
 from model.materials import Material
@@ -18,14 +18,19 @@ FARTHER = 1.5  # times the displacement reached so far
 WORTH_SAYING = 0.7  # factor by which a measurement must shrink an uncertainty at least
 
 
-def expected_uncertainties(curves: Sequence[Curve], material: Material) -> dict[str, Quantity]:
+def expected(curves: Sequence[Curve], material: Material) -> Statement:
     """What `calibration.identify.identify` would state if ``material`` were the truth and the noise as stated.
 
     Only the displacements, voltages and uncertainties of ``curves`` matter, not their forces: this is for planning.
     """
     problem = Problem(curves, select(curves, material), len(material.mu), material, trust_noise=True)
     x = problem.vector(material)
-    return state(problem, x, np.zeros(x.size, dtype=np.bool_), held=()).quantities
+    return state(problem, x, np.zeros(x.size, dtype=np.bool_), held=())
+
+
+def expected_uncertainties(curves: Sequence[Curve], material: Material) -> dict[str, Quantity]:
+    """The quantities of `expected`."""
+    return expected(curves, material).quantities
 
 
 def advice(curves: Sequence[Curve], material: Material, quantities: Mapping[str, Quantity]) -> list[str]:

@@ -189,6 +189,7 @@ class Statement:
     nuisance: dict[str, Zero]
     stretch: tuple[float, float]
     stiffness_curve: Stiffness
+    along: list[Quantity]  # the same, with their budgets
     parameters: list[str]
     correlation: list[list[float]]
     condition: float
@@ -277,6 +278,7 @@ def state(
             secant_modulus=tuple(q.value for q in along),
             uncertainty=tuple(q.uncertainty for q in along),
         ),
+        along=along,
         parameters=list(slopes),
         correlation=_correlation(np.array(list(slopes.values())), propagation.covariance.matrix),
         condition=_condition(problem, x, free),

@@ -280,6 +280,31 @@ def fit_tests(tests: tuple[Path, ...], out: Path | None, terms: int, predict: tu
         click.echo(f"written: {out}")
 
 
+@main.command("plan")
+@click.argument("scene", type=FILE)
+@click.option("--time", "time", required=True, help="Time of the rig, with its unit: 10min, 300s, 1.5h.")
+@click.option("--fit", type=FILE, help="Result of `dea-rig fit` on a first run: plan for that film, not the scene's.")
+@click.option("--terms", type=click.IntRange(1, 2), default=2, show_default=True, help="Ogden terms to be fitted.")
+@click.option("-o", "--out", type=FILE, help="Protocol to write; never overwrites.")
+def plan_command(scene: Path, time: str, fit: Path | None, terms: int, out: Path | None) -> None:
+    """Propose where to hold the film of SCENE, and how long, to learn most about it in the given time.
+
+    Compares what the protocol is expected to tell with the uniform sweep in the same time. Touches no hardware.
+    """
+    from rig.identification import write_text
+    from rig.outputs import check_new
+    from rig.proposal import film_of, parse_time, propose_protocol
+    from rig.tables import proposal_table, show
+
+    check_new(out)
+    found = propose_protocol(scene, parse_time(time), None if fit is None else film_of(fit), terms=terms)
+    if out is not None:
+        write_text(out, found.text)
+    show(proposal_table(found))
+    if out is not None:
+        click.echo(f"written: {out}")
+
+
 @main.command()
 @click.argument("log", type=FILE)
 @click.option("--save", type=FILE, help="Write a Rerun recording instead of opening the viewer.")

@@ -74,7 +74,7 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
     if ports is not None:
         scene = scene.with_ports(ports)
     protocol, protocol_text = load_protocol(protocol_path)
-    certificates = _certificates(scene, scene_path.parent)
+    certificates = certificates_of(scene, scene_path.parent)
     actions = plan(protocol, scene)
     predictions = check_plan(actions, scene)
     _check_ranges(certificates, actions, predictions)
@@ -168,7 +168,8 @@ def _sources(out: Path) -> list[Source]:
     return [Remote(out.resolve()), *([keyboard] if keyboard is not None else [])]
 
 
-def _certificates(scene: Scene, folder: Path) -> dict[str, Certificate]:
+def certificates_of(scene: Scene, folder: Path) -> dict[str, Certificate]:
+    """The certificates that the scene in ``folder`` names, by role; ConfigError when one cannot be used."""
     found: dict[str, Certificate] = {}
     for role, table in scene.instruments.items():
         if table.certificate is None:

@@ -205,7 +205,12 @@ def _errors(run: Run, scene: Scene, certificates: Mapping[str, Certificate]) -> 
     force = certificates.get("force")
     if force is None:
         raise DataError(f"{run.log.path}: the log holds no certificate of the force sensor; its noise is not known.")
-    dimensions = scene.specimen
+    return errors_of(scene, certificates)
+
+
+def errors_of(scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErrors:
+    """Noise and uncertainties of the curves of a scene with these certificates; that of the force must be there."""
+    force, dimensions = certificates["force"], scene.specimen
     errors = CurveErrors(
         force_noise=force.noise,
         force_gain=force.gain_uncertainty,

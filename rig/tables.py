@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rig.calibrate.analysis import Calibration
     from rig.experiment import Experiment
     from rig.identification import Found
+    from rig.proposal import Proposal
 
 
 def show(*tables: RenderableType) -> None:
@@ -110,8 +111,32 @@ def calibration_table(found: Calibration) -> list[RenderableType]:
     return tables
 
 
+def proposal_table(found: Proposal) -> Group:
+    """Where the planned protocol holds the film, and what it is expected to tell beside the uniform sweep."""
+    route = Table(title=found.planned.protocol.title)
+    for heading in ("voltage / V", "displacement / mm", "hold / s"):
+        route.add_column(heading, justify="right")
+    for dwell in found.route:
+        route.add_row(f"{dwell.voltage:g}", f"{1e3 * dwell.h:.2f}", f"{dwell.seconds:.1f}")
+    table = Table(title="Expected relative standard uncertainty, %")
+    table.add_column("quantity", no_wrap=True)
+    for heading in ("planned", "uniform sweep", "planned, noise and zeros", "sweep, noise and zeros"):
+        table.add_column(heading, justify="right")
+    for name in found.wanted:
+        values = (design[name] for design in (found.planned.combined, found.sweep.combined))
+        noise = (design[name] for design in (found.planned.random, found.sweep.random))
+        table.add_row(_NAMES.get(name, name), *(f"{100 * value:.2g}" for value in (*values, *noise)))
+    return Group(
+        route,
+        table,
+        f"planned {_minutes(found.planned.duration)}, sweep {_minutes(found.sweep.duration)}, homing to return. The "
+        f"sweep would have to record {found.gain:.2g} times as long for the same noise; gains and dimensions gain "
+        "nothing by time. What is best depends on the film: after a first run plan with its result (--fit).",
+    )
+
+
 def _minutes(seconds: float) -> str:
-    return f"{int(seconds // 60)} min {seconds % 60:.0f} s"
+    return f"{round(seconds) // 60} min {round(seconds) % 60} s"
 
 
 def identification_table(found: Identification) -> Group:

@@ -134,6 +134,8 @@ class Run:
     def curves(self, specimen: Specimen, **errors: Unpack[CurveErrors]) -> list[Curve]:
         """The recorded parts as curves ready for identification: one per step, voltage and cycle.
 
+        Ramps and holds that follow each other at one voltage are one curve.
+
         Parameters
         ----------
         specimen : model.specimen.Specimen
@@ -145,9 +147,14 @@ class Run:
         from calibration.curve import Curve
 
         parts: dict[tuple[int, float, int], list[int]] = {}
+        start: Phase | None = None  # of the ramps and holds that are going on
         for index, phase in enumerate(self.phases):
+            loose = phase.record and phase.kind in ("ramp", "hold")
+            if not loose or start is None or start.voltage != phase.voltage:
+                start = phase if loose else None
             if phase.record:
-                parts.setdefault((phase.step, phase.voltage, phase.cycle), []).append(index)
+                step = start.step if start is not None else phase.step
+                parts.setdefault((step, phase.voltage, phase.cycle), []).append(index)
         curves = []
         for (step, voltage, cycle), indexes in parts.items():
             rows = np.flatnonzero(np.isin(self.phase, indexes))

@@ -1,0 +1,183 @@
+"""The planned protocol: inside limits and time, better than the uniform sweep, and so in simulated experiments."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from calibration.curve import Curve
+from calibration.identify import identify, secant_modulus
+from model.materials import NAMED, Material
+from model.membrane import solve_many
+from rig import proposal
+from rig.cli import main
+from rig.errors import ConfigError, LimitError
+from rig.experiment import certificates_of, prepare, run
+from rig.identification import identify_logs
+from rig.protocol import Protocol, load_protocol
+from rig.scene import load_scene
+
+FIXTURES = Path(__file__).resolve().parents[2] / "sim_fixtures"
+SCENE = FIXTURES / "scenes" / "cone-4mm.toml"
+PARKER = NAMED["parker-cao2018"]  # what is really mounted in the simulated scene
+ONE_TERM = Material(name="one term", mu=(37_834.0,), alpha=(5.4985,), eps_r=1.7)  # the one-term film nearest to it
+
+
+@pytest.fixture(scope="module")
+def half() -> proposal.Proposal:
+    return proposal.propose_protocol(SCENE, 300.0, ONE_TERM, terms=1)
+
+
+@pytest.fixture(scope="module")
+def whole() -> proposal.Proposal:
+    return proposal.propose_protocol(SCENE, 600.0, ONE_TERM, terms=1)
+
+
+@pytest.mark.slow
+def test_in_half_the_time_it_is_expected_to_tell_as_much_as_the_sweep(
+    half: proposal.Proposal, whole: proposal.Proposal
+) -> None:
+    assert half.planned.duration <= 300.0
+    assert whole.sweep.duration == pytest.approx(600.0, abs=2.0)
+    for name in ("stiffness", "eps_r"):
+        assert half.planned.random[name] <= whole.sweep.random[name]
+        assert whole.planned.random[name] < half.planned.random[name]
+
+
+def test_the_file_is_a_protocol_that_the_check_lets_through(half: proposal.Proposal, tmp_path: Path) -> None:
+    path = tmp_path / "planned.toml"
+    path.write_text(half.text, encoding="utf-8")
+    assert load_protocol(path)[0] == half.planned.protocol
+    experiment = prepare(SCENE, path)  # raises where a limit does not hold
+    assert experiment.duration == pytest.approx(half.planned.duration)
+    assert 270.0 < experiment.duration <= 300.0
+
+
+def test_limits_keep_places_out(tmp_path: Path) -> None:
+    text = SCENE.read_text(encoding="utf-8").replace("../calibrations", str(FIXTURES / "calibrations"))
+    text = text.replace("force_N = 0.9", "force_N = 0.2").replace("speed_mm_per_s = 5.0", "speed_mm_per_s = 1.0")
+    text = text.replace("field_V_per_um = 80.0", "field_V_per_um = 60.0")
+    path = tmp_path / "scene.toml"
+    path.write_text(text, encoding="utf-8")
+    found = proposal.propose_protocol(path, 300.0)
+    scene, _ = load_scene(path)
+    h, voltage = (np.array([getattr(dwell, name) for dwell in found.route]) for name in ("h", "voltage"))
+    states = solve_many(scene.specimen.specimen(), h, voltage)
+    assert states.force.max() <= 0.2
+    assert states.peak_field.max() <= 60e6
+    for step in found.planned.protocol.step:
+        assert getattr(step, "speed_mm_per_s", 0.0) <= 1.0
+
+
+def test_without_hv_there_is_no_voltage_and_no_permittivity() -> None:
+    found = proposal.propose_protocol(FIXTURES / "scenes" / "no-hv.toml", 300.0)
+    assert found.wanted == ("stiffness",)
+    assert all(dwell.voltage == 0.0 for dwell in found.route)
+    assert "voltage" not in {step.do for step in found.planned.protocol.step}
+    assert found.gain > 1.0
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("10min", 600.0), ("90 s", 90.0), ("1.5h", 5400.0)])
+def test_times_carry_their_unit(text: str, seconds: float) -> None:
+    assert proposal.parse_time(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["10", "min", "-5s", "nan s", "99h", "1e400s"])
+def test_other_times_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="10min"):
+        proposal.parse_time(text)
+
+
+def test_too_little_time_is_refused_in_words() -> None:
+    with pytest.raises(LimitError, match="50 s are not enough: homing"):
+        proposal.propose_protocol(SCENE, 50.0)
+
+
+def test_the_command_writes_the_protocol_and_never_over_another(tmp_path: Path) -> None:
+    out = tmp_path / "planned.toml"
+    fit = tmp_path / "fit.json"
+    found = {"mu1": 2e4, "alpha1": 5.0}
+    fit.write_text(json.dumps({"terms": 1, "quantities": {name: {"value": value} for name, value in found.items()}}))
+    scene = str(FIXTURES / "scenes" / "no-hv.toml")
+    arguments = ["plan", scene, "--time", "3min", "--fit", str(fit), "-o", str(out)]
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0, done.output
+    assert "stiffness" in done.output
+    assert load_protocol(out)[0].step[0].do == "home"
+    assert CliRunner().invoke(main, arguments).exit_code == 2
+    refused = CliRunner().invoke(main, ["plan", scene, "--time", "3min", "--fit", scene])
+    assert refused.exit_code == 2
+    assert "not a result of `dea-rig fit`" in refused.output
+
+
+# --- simulated experiments
+
+
+def experiment(protocol: Protocol, seed: int) -> list[Curve]:
+    """What a run of ``protocol`` records of a one-term film, with noise and zeros as the certificates state them."""
+    scene, _ = load_scene(SCENE)
+    random = np.random.default_rng(seed)
+    zero_f, zero_h = random.standard_normal(2)
+    made = []
+    specimen = scene.specimen.specimen()  # with the scene's guess, from which the fit starts
+    for curve in proposal.recorded(protocol, scene, certificates_of(scene, SCENE.parent), specimen):
+        grid = np.linspace(0.0, 13.5e-3, 200)
+        force = solve_many(
+            curve.specimen.with_material(ONE_TERM), grid, curve.nominal_voltage, wrinkling="tension_field"
+        )
+        known = np.isfinite(force.force)
+        exact = np.interp(curve.h, grid[known], force.force[known])
+        n = curve.h.size
+        made.append(
+            replace(
+                curve,
+                force=exact + curve.force_zero * zero_f + curve.force_noise * random.standard_normal(n),
+                h=curve.h + curve.displacement_zero * zero_h + curve.displacement_noise * random.standard_normal(n),
+            )
+        )
+    return made
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_in_half_the_time_it_does_tell_as_much(half: proposal.Proposal, whole: proposal.Proposal) -> None:
+    """Scatter about the truth over 24 simulated experiments each; two scatters of 24 differ by chance by 20 %."""
+    scatter, stated = {}, {}
+    for label, protocol in (("planned", half.planned.protocol), ("sweep", whole.sweep.protocol)):
+        errors, uncertainties = [], []
+        for seed in range(24):
+            found = identify(experiment(protocol, seed), terms=1, starts=1)
+            stiffness = found.quantities["stiffness"]
+            known = secant_modulus(ONE_TERM, *found.stretch)
+            eps_r = found.quantities["eps_r"]
+            errors.append(((stiffness.value - known) / known, (eps_r.value - ONE_TERM.eps_r) / ONE_TERM.eps_r))
+            parts = ("noise", "force zero", "displacement zero")
+            uncertainties.append(
+                [math.hypot(*(q.budget.get(part, 0.0) for part in parts)) / q.value for q in (stiffness, eps_r)]
+            )
+        scatter[label] = np.sqrt(np.mean(np.square(errors), axis=0))
+        stated[label] = np.median(uncertainties, axis=0)
+    assert (scatter["planned"] < 1.45 * scatter["sweep"]).all(), scatter
+    assert (stated["planned"] < 1.1 * stated["sweep"]).all(), stated
+    assert (scatter["planned"] < 1.5 * stated["planned"]).all(), (scatter, stated)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_planned_run_on_the_simulated_bench_is_identified(tmp_path: Path) -> None:
+    """Byte by byte: the planned protocol runs to its end in its time, and what is found holds the truth."""
+    planned = proposal.propose_protocol(SCENE, 150.0)
+    path, log = tmp_path / "planned.toml", tmp_path / "planned.mcap"
+    path.write_text(planned.text, encoding="utf-8")
+    outcome = run(prepare(SCENE, path), log, lambda done, total, label: None)
+    assert outcome.duration <= 150.0
+    found = identify_logs([log], terms=2).identification
+    assert len({curve.nominal_voltage for curve in found.curves}) == len(found.curves)
+    for name, known in (("eps_r", PARKER.eps_r), ("stiffness", secant_modulus(PARKER, *found.stretch))):
+        quantity = found.quantities[name]
+        assert abs(quantity.value - known) < 3.0 * quantity.uncertainty, name
+        assert quantity.relative < 2.0 * planned.planned.combined[name]
