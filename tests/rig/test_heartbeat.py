@@ -111,11 +111,11 @@ def test_a_guard_that_was_held_up_itself_does_not_blame_the_engine(rig: Rig) -> 
 
 def test_an_engine_that_waits_for_the_guards_answer_is_excused_for_so_long_and_no_longer(rig: Rig) -> None:
     rig.go_on(0.1, beating=True)
-    rig.now += 0.5
-    rig.guard.excuse(0.45)
+    rig.now += 0.19
+    rig.guard.excuse(0.1)
     rig.guard.turn(rig.now)
     assert rig.guard.state is GuardState.LIVE
-    with pytest.raises(FaultError, match="silent"):
+    with pytest.raises(FaultError):
         rig.go_on(DEADLINE_S, beating=False)
 
 
