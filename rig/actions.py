@@ -42,6 +42,10 @@ def carry_out(engine: Engine, action: Action) -> Turns:
         from rig.calibrate.actions import carry_out as calibrate
 
         return calibrate(engine, action)
+    if action.bias is not None:
+        from rig.follow.actions import carry_out as follow
+
+        return follow(engine, action)
     return _BY_KIND.get(action.kind, _move_or_voltage)(engine, action)
 
 

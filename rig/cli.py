@@ -186,6 +186,18 @@ def calibrate(
 
 
 @main.command()
+@click.argument("log", type=FILE)
+@click.option("-o", "--out", type=FILE, help="The table as CSV.")
+@click.option("--picture", type=FILE, help="PNG or SVG.")
+@click.option("--material", help="Of the film for the expectation, by name; default: the scene's.")
+def stroke(log: Path, out: Path | None, picture: Path | None, material: str | None) -> None:
+    """Stroke and work against a virtual spring, mass or second cone in LOG: measured beside expected."""
+    from rig.commands.stroke import tell_strokes
+
+    tell_strokes(log, out, picture, material)
+
+
+@main.command()
 @click.argument("quantity", type=click.Choice(["force", "displacement", "hv"]))
 @click.argument("scene", type=FILE)
 @click.option("--standard", type=click.FloatRange(min=0, min_open=True), required=True, help="In g, mm or V.")

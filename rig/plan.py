@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,8 +17,12 @@ from model.membrane import Status, solve, solve_many
 from model.specimen import Specimen
 from rig import protocol as steps
 from rig.errors import ConfigError, LimitError
+from rig.follow.steps import Follow
 from rig.safety.limits import Limits, capacitance
 from rig.scene import Scene
+
+if TYPE_CHECKING:
+    from model.bias import Bias
 
 HOMING_S = 20.0  # only for the estimate: a long-travel stage at its homing speed
 REGAIN_SPEED = 2e-3  # m/s, on the way back to where a resumed step begins
@@ -30,7 +35,7 @@ class Action:
 
     ``kind`` is the protocol step it came from. ``h`` and ``voltage`` are (before, after) in metres and volts;
     ``speed`` in m/s for moves; ``duration`` is the expected time in seconds. ``record`` is True where the
-    samples are data of the film: the fit takes these.
+    samples are data of the film: the fit takes these. ``bias`` is the law that a follow step plays.
     """
 
     step: int
@@ -43,6 +48,7 @@ class Action:
     cycle: int = 0
     record: bool = False
     parameters: dict[str, float] = field(default_factory=dict)
+    bias: Bias | None = None
 
     @property
     def moves(self) -> bool:
@@ -252,6 +258,14 @@ def _actions(numbered: Iterable[tuple[int, steps.Step | Regain]], scene: Scene) 
             if contact:
                 yield Action(number, kind, "back from the film", (h, target), (0, 0), abs(target - h) / speed, speed)
             h, contact = 0.0, False
+        elif isinstance(step, Follow):
+            from rig.follow.plan import actions as follow_actions
+
+            if not contact or v > 0:
+                raise LimitError(f"Step {number} (follow) begins in contact with the film and at 0 V.")
+            for action in follow_actions(number, step, scene, h):
+                yield action
+                h = action.h[1]
         else:
             from rig.calibrate.plan import actions as calibration_actions
 

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from rig.calibrate import steps as calibration
+from rig.follow.steps import Follow
 from rig.table import Table
 from rig.toml_file import load_table
 
@@ -103,7 +104,7 @@ class Return(Table):
 
 
 Step = Annotated[
-    Home | Zero | Approach | Precondition | Ramp | Hold | Prompt | Voltage | Sweep | Return | calibration.Step,
+    Home | Zero | Approach | Precondition | Ramp | Hold | Prompt | Voltage | Sweep | Return | Follow | calibration.Step,
     Field(discriminator="do"),
 ]
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from drivers.discovery import Found as FoundDevice
     from rig.calibrate.analysis import Calibration
     from rig.experiment import Experiment
+    from rig.follow.analysis import Stroke
     from rig.identification import Found
     from rig.proposal import Proposal
 
@@ -58,6 +59,25 @@ def plan_table(experiment: Experiment) -> Table:
                 row.append(f"{prediction.peak_field * 1e-6:.1f}")
                 row.append(f"{prediction.minimum_hoop_stress * 1e-3:.0f}")
         table.add_row(*row)
+    return table
+
+
+def stroke_table(strokes: Sequence[Stroke]) -> Table:
+    """Strokes of virtual biases, measured beside expected."""
+    table = Table(title="Stroke and work against a virtual bias", caption="Uncertainties are standard ones (k = 1).")
+    table.add_column("step and bias")
+    for heading in ("U / V", "stroke / um", "model / um", "off by", "work / mJ", "model / mJ"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for one in strokes:
+        table.add_row(
+            f"{one.step} {one.kind}",
+            f"{one.voltage:.0f}",
+            f"{one.stroke * 1e6:.1f} +- {one.stroke_uncertainty * 1e6:.1f}",
+            f"{one.expected_stroke * 1e6:.1f}",
+            f"{one.deviation * 100:+.1f} %",
+            f"{one.work * 1e3:.4f} +- {one.work_uncertainty * 1e3:.4f}",
+            f"{one.expected_work * 1e3:.4f}",
+        )
     return table
 
 

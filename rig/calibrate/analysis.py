@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.certificate import Certificate, parse_certificate
 from calibration.sensor import Characteristic, SensorError, Standstill, characterise
 from rig.calibrate import steps
 from rig.errors import DataError
@@ -123,12 +122,6 @@ def calibrate(path: Path, quantity: Quantity) -> Calibration:
     )
 
 
-def certificate_in(run: Run, role: str) -> Certificate | None:
-    """The certificate that was used for ``role`` during the run."""
-    attached = run.log.attachments.get(f"certificate.{role}.toml")
-    return None if attached is None else parse_certificate(attached.data, f"{run.log.path} ({attached.name} inside)")
-
-
 def standstills(run: Run, quantity: Quantity) -> list[Standstill]:
     """Every standstill of the run; cycle 0 is preloading and is left out.
 
@@ -191,7 +184,7 @@ def _readings(run: Run, quantity: Quantity) -> tuple[Floats, Floats]:
     good = table["flags"] == 0 if role != "hv" else np.ones(len(table["t_s"]), dtype=bool)
     values = table["force_N" if quantity == "compliance" else _COLUMN[role]][good]
     if role == "hv":
-        used = certificate_in(run, "hv")
+        used = run.certificates.get("hv")
         values = values / (used.gain if used is not None else 1.0)
     return table["t_s"][good], values
 
@@ -205,7 +198,7 @@ def _phases(run: Run, kind: str) -> list[tuple[Phase, float]]:
 def common_uncertainties(run: Run, quantity: Quantity) -> dict[str, float]:
     """Relative standard uncertainties that all standards of ``quantity`` share, from the protocol in the log."""
     if quantity == "compliance":
-        force = certificate_in(run, "force")
+        force = run.certificates.get("force")
         return {"force certificate": force.gain_uncertainty} if force is not None else {}
     common: dict[str, float] = {}
     for step in _protocol(run).step:

@@ -109,8 +109,8 @@ def verify(quantity: Quantity, scene_path: Path, standard: float, log: Path, run
 
 def judge(log: Path, quantity: Quantity) -> Verdict:
     """The verdict that the log of a one-point check supports."""
-    run = load_run(log)
-    certificate = analysis.certificate_in(run, ROLE[quantity])
+    run = load_run(log, {})
+    certificate = run.certificates.get(ROLE[quantity])
     if certificate is None:
         raise DataError(f"{log}: no certificate of {quantity} was used; there is nothing to hold the check against.")
     try:

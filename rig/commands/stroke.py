@@ -1,0 +1,62 @@
+"""``dea-rig stroke``: what a follow step measured, beside the model."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import click
+
+from model.materials import NAMED
+from rig.errors import ConfigError
+from rig.follow.analysis import Stroke, strokes
+from rig.identification import write_text
+from rig.outputs import check_new
+from rig.tables import show, stroke_table
+
+UNITS = {
+    "nominal_voltage": "V",
+    "voltage": "V",
+    "start": "m",
+    "stroke": "m",
+    "stroke_uncertainty": "m",
+    "work": "J",
+    "work_uncertainty": "J",
+    "expected_stroke": "m",
+    "expected_work": "J",
+}
+
+
+def tell_strokes(log: Path, out: Path | None, picture: Path | None, material: str | None) -> None:
+    """Show the table, and write it and its picture where asked for.
+
+    Raises
+    ------
+    RigError
+        When an output exists, the material is not known, or the log holds no strokes.
+    """
+    check_new(out, picture)
+    if material is not None and material not in NAMED:
+        raise ConfigError(f"--material {material}: not known; known are {', '.join(sorted(NAMED))}.")
+    found = strokes(log, None if material is None else NAMED[material])
+    show(stroke_table(found))
+    if out is not None:
+        write_text(out, _csv(found))
+    if picture is not None:
+        from rig.follow.picture import draw
+
+        draw(found, picture)
+    for path in (out, picture):
+        if path is not None:
+            click.echo(f"written: {path}")
+
+
+def _csv(found: list[Stroke]) -> str:
+    names = [field.name for field in fields(Stroke)]
+    heading = ",".join(f"{name}_{UNITS[name]}" if name in UNITS else name for name in names)
+    rows = [",".join(_cell(getattr(one, name)) for name in names) for one in found]
+    return "\n".join([heading, *rows]) + "\n"
+
+
+def _cell(value: float | str) -> str:
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
