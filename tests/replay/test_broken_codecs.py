@@ -39,6 +39,15 @@ def gsv8_byte_order(patch):
     patch.setattr(drivers.gsv8, "struct", ByteOrder(">", "<", "f"))
 
 
+def gsv8_wrong_width(patch):
+    patch.setitem(drivers.gsv8._WIDTH, "float32", 3)
+    patch.setattr(drivers.gsv8, "struct", ByteOrder(">", "<", "f"))
+
+
+def gsv8_failing(patch):
+    patch.setattr(drivers.gsv8.Decoder, "_parse", lambda self, buffer, at, length: struct.unpack(">f", buffer))
+
+
 def gsv8_sign(patch):
     sample = drivers.gsv8.GSV8._sample
     patch.setattr(
@@ -137,6 +146,8 @@ CASES = [
     ("stage", "paper", zaber_scale),
     ("stage", "paper", zaber_moving),
     ("force", "paper", gsv8_byte_order),
+    ("force", "paper", gsv8_wrong_width),
+    ("force", "paper", gsv8_failing),
     ("force", "paper", gsv8_sign),
     ("force", "paper", gsv8_last_digit),
     ("displacement", "paper", keyence_sign),
