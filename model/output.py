@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 
@@ -99,6 +101,27 @@ def fine_table(modes: int) -> Array:
     return barycentric(table(modes).xi, -np.cos(np.linspace(0.0, np.pi, FINE)))
 
 
+Number = TypeVar("Number", float, Array)
+POLISH = 3  # Newton steps from the largest of the `FINE` points to the polynomial's own maximum
+
+
+def series(c: Sequence[Number], xi: Number) -> tuple[Number, Number, Number]:
+    """Value and two derivatives at ``xi`` of the Legendre series with coefficients ``c``."""
+    before, now = 0.0 * xi + 1.0, xi
+    before1, now1 = 0.0 * xi, before
+    before2, now2 = before1, before1
+    value, slope, curve = c[0] + c[1] * xi, c[1] * now1, before1
+    for n in range(2, len(c)):
+        k = 2.0 * n - 1.0
+        before2, now2 = now2, before2 + k * now1
+        before1, now1 = now1, before1 + k * now
+        before, now = now, (k * xi * now - (n - 1.0) * before) / n
+        value = value + c[n] * now
+        slope = slope + c[n] * now1
+        curve = curve + c[n] * now2
+    return value, slope, curve
+
+
 def _largest(grid: Grid, values: Array, ends: Array) -> tuple[Array, Array]:
     """Largest values over the film, (K, S), from those at the points (K, Q, M, S) and at both edges (K, 2, S).
 
@@ -108,21 +131,20 @@ def _largest(grid: Grid, values: Array, ends: Array) -> tuple[Array, Array]:
     radius = np.where(ends[:, 0] >= ends[:, 1], np.exp(grid.breaks[0]), 1.0)
     kind, state = np.nonzero(values.max(axis=(1, 2)) > best)
     if len(state):
-        fine = values[kind, :, :, state].swapaxes(1, 2) @ fine_table(grid.table.modes).T
-        flat = fine.reshape(len(state), -1)
-        top = flat.argmax(axis=1)
-        element, place = np.divmod(top, FINE)
-        place = np.clip(place, 1, FINE - 2)
-        some = np.arange(len(state))
-        low, mid, high = (fine[some, element, place + k] for k in (-1, 0, 1))
-        curve = low - 2.0 * mid + high
-        shift = np.where(curve < 0.0, np.clip(0.5 * (low - high) / curve, -1.0, 1.0), 0.0)
-        peak = np.maximum(flat[some, top], mid - 0.25 * (low - high) * shift)
+        t = grid.table
+        inside = values[kind, :, :, state]
+        fine = inside.swapaxes(1, 2) @ fine_table(t.modes).T
+        element, place = np.divmod(fine.reshape(len(state), -1).argmax(axis=1), FINE)
+        c = list(t.to_legendre @ inside[np.arange(len(state)), :, element].T)
+        angle = np.pi / (FINE - 1) * (place + np.array([[-1], [0], [1]]))
+        low, xi, high = -np.cos(np.clip(angle, 0.0, np.pi))
+        for _ in range(POLISH):
+            _, slope, curve = series(c, xi)
+            xi = np.clip(np.where(curve < 0.0, xi - slope / curve, xi), low, high)
+        peak = series(c, xi)[0]
         better = peak > best[kind, state]
-        # The points are equidistant in the angle, so the parabola is laid in the angle too.
-        angle = (place + shift) * (np.pi / (FINE - 1))
         x0, x1 = grid.breaks[element, state], grid.breaks[element + 1, state]
-        at = np.exp(x0 + 0.5 * (1.0 - np.cos(angle)) * (x1 - x0))
+        at = np.exp(x0 + 0.5 * (1.0 + xi) * (x1 - x0))
         best[kind, state] = np.where(better, peak, best[kind, state])
         radius[kind, state] = np.where(better, at, radius[kind, state])
     return best, radius

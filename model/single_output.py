@@ -6,8 +6,8 @@ import math
 from math import exp, log1p
 from typing import TYPE_CHECKING
 
-from model.law import Array
-from model.single_parts import Cone, Film, Floats, Found, Panel, Stray, stress
+from model.output import FINE, POLISH, series
+from model.single_parts import Cone, Film, Floats, Found, Panel, Stray, Tables, stress
 
 if TYPE_CHECKING:
     from model.single import Solver
@@ -32,7 +32,7 @@ def found(solver: Solver, lam: float, error: float, steps: int) -> Found:
         top, place = edges[ring][kind], solver.breaks[-1 if ring else 0]
         for number, columns in enumerate(inside):
             if max(columns[kind]) > top:
-                value, share = _peak(solver.tables.fine, columns[kind])
+                value, share = _peak(solver.tables, columns[kind])
                 if value > top:
                     left, right = solver.breaks[number : number + 2]
                     top, place = value, left + share * (right - left)
@@ -156,14 +156,18 @@ def _folded(film: Film, u: float, natural: float, s1: float) -> tuple[Values, fl
     return (u + lnlp + natural, 0.0, -s1 * exp(u), u + lnlp, natural), 2.0 * b / (h11 + 2.0 * b)
 
 
-def _peak(fine: Array, column: Floats) -> tuple[float, float]:
+def _peak(tables: Tables, column: Floats) -> tuple[float, float]:
     """Largest value between the points and its share of the way from the disk (in ln R); see `model.output`."""
-    values = (fine @ column).tolist()
-    last = len(values) - 1
-    top = max(range(last + 1), key=values.__getitem__)
-    place = min(max(top, 1), last - 1)
-    low, mid, high = values[place - 1 : place + 2]
-    curve = low - 2.0 * mid + high
-    shift = min(max(0.5 * (low - high) / curve, -1.0), 1.0) if curve < 0.0 else 0.0
-    peak = max(values[top], mid - 0.25 * (low - high) * shift)
-    return peak, 0.5 * (1.0 - math.cos((place + shift) * math.pi / last))
+    values = (tables.fine @ column).tolist()
+    top = max(range(len(values)), key=values.__getitem__)
+    low, xi, high = (-math.cos(min(max(top + k, 0), FINE - 1) * math.pi / (FINE - 1)) for k in (-1, 0, 1))
+    c = (tables.to_legendre @ column).tolist()
+    for _ in range(POLISH):
+        _, slope, curve = series(c, xi)
+        if curve >= 0.0:
+            break
+        step = slope / curve
+        xi = min(max(xi - step, low), high)
+        if abs(step) < 1e-6:
+            break
+    return series(c, xi)[0], 0.5 * (1.0 + xi)

@@ -109,6 +109,7 @@ class Tables:
     end_slopes: Array  # (2, Q)
     tests: tuple[Floats, Floats, Floats, Floats]
     fine: Array
+    to_legendre: Array  # (Q, Q)
 
 
 @lru_cache(maxsize=32)
@@ -131,6 +132,7 @@ def tables_of(modes: int, cut: bool) -> Tables:
         end_slopes=t.end_slopes,
         tests=(disk.tolist(), disk_slope.tolist(), ring.tolist(), ring_slope.tolist()),
         fine=output.fine_table(modes),
+        to_legendre=t.to_legendre,
     )
 
 

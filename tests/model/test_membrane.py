@@ -13,6 +13,7 @@ import scipy.constants
 
 from model.materials import EPSILON_0, NAMED, Material
 from model.membrane import Status, Wrinkling, solve, solve_many
+from model.reference import reference
 from model.specimen import Specimen
 
 PARKER = NAMED["parker-cao2018"]
@@ -323,3 +324,21 @@ def test_a_solution_nearby_shortens_the_way_and_changes_no_answer() -> None:
     assert warm.force == pytest.approx(cold.force, rel=1e-8)
     other = solve(film(8, 1.0), 10e-3, near=near)
     assert other.force == pytest.approx(solve(film(8, 1.0), 10e-3).force, rel=1e-8)
+
+
+def test_the_least_hoop_stress_inside_the_film_converges_with_the_tolerance() -> None:
+    """Its minimum is the polynomial's own, not that of a sample: the error falls to round-off, as the force's does."""
+    films = [
+        film(a, lp, m) for a in (0.4, 2.0, 10.0) for lp in (1.0, 1.2) for m in (PARKER, NAMED["treloar-ogden1972"])
+    ]
+    specimens = [f for f in films for _ in range(2)]
+    h = np.tile([2e-3, 20e-3], len(films))
+    truth = reference(specimens, h, np.zeros(len(h)))
+    shear = np.array([f.material.shear_modulus for f in specimens])
+    errors = []
+    for tolerance in (1e-4, 1e-8, 1e-12):
+        found = solve_many(specimens, h, tolerance=tolerance)
+        errors.append(np.abs(found.min_hoop_stress - truth.min_hoop_stress) / shear)
+        assert np.all(errors[-1] < 3.0 * np.sqrt(tolerance))
+    assert errors[0].max() > 1e-4  # it is found inside the film: at an edge it is as good as the force
+    assert errors[2].max() < 1e-8
