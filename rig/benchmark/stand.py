@@ -238,6 +238,8 @@ def _lives(pid: int) -> bool:
         return False
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except ProcessLookupError:  # it went while it was looked at
+        return False
     except FileNotFoundError:
         if Path("/proc/self").exists():
             return False

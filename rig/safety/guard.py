@@ -84,6 +84,7 @@ class Guard:
         self._fresh = dict(fresh or {})
         self._beat: Heartbeat | None = None
         self._alive_at: float | None = None  # when the engine last gave a sign of life; None: not yet since arming
+        self.longest_silence = 0.0  # s between two signs of life while armed; to be held against DEADLINE_S
         self._goal = 0.0  # displacement to which the disk is being moved
         self._next_film_check = -math.inf
         self._low_samples = 0
@@ -227,6 +228,8 @@ class Guard:
                 raise ValueError(f"it is number {beat.counter} after {last}")
         except ValueError as error:
             raise self._off(f"the engine's heartbeat cannot be believed: {error}") from None
+        if self._alive_at is not None and self.state is not GuardState.SAFE:
+            self.longest_silence = max(self.longest_silence, now - self._alive_at)
         self._beat = beat
         self._alive_at = now
 

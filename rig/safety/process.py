@@ -278,7 +278,7 @@ class Server:
                 "ready": supply.ready,
                 "identity": [supply.identity.model, supply.identity.serial, supply.identity.firmware],
                 "settings": supply.settings,
-                "counters": supply.counters,
+                "counters": supply.counters | {"heartbeat_gap_max_us": round(guard.longest_silence * 1e6)},
             }
         )
 

@@ -76,6 +76,7 @@ def test_a_beating_engine_is_left_alone(rig: Rig) -> None:
     before = list(rig.supply.words)
     rig.go_on(2.0, beating=True)
     assert rig.guard.state is GuardState.LIVE and rig.supply.words == before
+    assert rig.guard.longest_silence == pytest.approx(INTERVAL_S / 2)
 
 
 def test_a_silent_engine_is_left_no_voltage_after_the_deadline_and_not_before(rig: Rig) -> None:
