@@ -24,7 +24,10 @@ from mcap.writer import CompressionType, Writer
 
 from rig.log import schema
 from rig.log.errors import LogError
+from rig.log.export import export
+from rig.log.info import info
 from rig.log.reader import Log, read_log
+from rig.log.recover import recover
 from rig.log.writer import LogWriter
 
 Rows = list[tuple[str, int, int, int, bytes]]  # topic, sequence number, times, payload
@@ -39,6 +42,24 @@ def is_part_of(found: Rows, truth: Rows) -> bool:
     """Whether ``found`` is ``truth`` with messages left out, and nothing else."""
     rest = iter(truth)
     return all(message in rest for message in found)
+
+
+def use(path: Path) -> None:
+    """What the commands make of a log: a result, or `LogError` and no output."""
+    for ending in (".mcap", ".csv", ".parquet", ".topic.csv"):
+        out = path.with_name(f"out{ending}")
+        try:
+            if ending == ".mcap":
+                assert "\x1b" not in info(path)
+                recovery = recover(path, out)
+                assert "\x1b" not in recovery.report
+                again = read_log(out)
+                assert again.ended and not again.gaps and recovery.exit_code in (0, 3)
+            else:
+                export(path, out, "/raw/force/rx" if "topic" in ending else None)
+            out.unlink()
+        except LogError:
+            assert not out.exists() and not list(path.parent.glob("out*.part"))
 
 
 class Reading:
@@ -76,7 +97,8 @@ class Reading:
         same = found == self.truth and log.attachments == whole.attachments and log.metadata == whole.metadata
         assert same or not log.whole
         self.results.append("same" if same else "less")
-        if len(self.results) % 50 == 0:  # the same messages, decoded
+        if len(self.results) % 50 == 0:  # the same messages, decoded; and what stands on them
+            use(self._copy)
             for topic in log.topics:
                 payloads = [payload for of, _, _, _, payload in found if of == topic]
                 assert [schema.encode(topic, m.fields) for m in log.messages(topic)] == payloads
@@ -222,7 +244,7 @@ def stock_metadata_with_evil_names() -> bytes:
     writer = Writer(out, compression=CompressionType.ZSTD)
     writer.start()
     number = writer.register_schema("x", "protobuf", b"")
-    channel = writer.register_channel("../../etc/passwd", "protobuf", number)
+    channel = writer.register_channel("../../etc/\x1b[31mpasswd", "protobuf", number)
     writer.add_message(channel, 0, b"x" * 30, 0)
     writer.add_attachment(0, 0, "../../../etc/passwd", "text/plain", b"root")
     writer.add_metadata("log", {"schema_version": str(schema.SCHEMA_VERSION), "\x1b[31m": "red"})
@@ -335,6 +357,14 @@ def test_hostile(name, hostile_costs):
             assert n >= 1  # the sound chunk behind the evil one is found
 
 
+@pytest.mark.parametrize("name", [name for name, content in HOSTILE.items() if len(content) < 2**20])
+def test_commands_on_hostile_logs(name, tmp_path):
+    path = tmp_path / "evil.mcap"
+    path.write_bytes(HOSTILE[name])
+    use(path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["evil.mcap"]
+
+
 def test_names_from_a_log_are_data(tmp_path):
     """A foreign log may name its attachments and topics as it likes; nothing is done with the names."""
     path = tmp_path / "evil.mcap"
@@ -342,4 +372,4 @@ def test_names_from_a_log_are_data(tmp_path):
     log = read_log(path)
     assert list(log.attachments) == ["../../../etc/passwd"]
     assert log.topics == {}
-    assert log.unknown == {"../../etc/passwd": 1}
+    assert log.unknown == {"../../etc/\x1b[31mpasswd": 1}
