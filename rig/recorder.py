@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample, StageSample
 from rig.clock import Clock
+from rig.errors import FaultError
 from rig.log import space
 from rig.log.errors import LogError
 
@@ -168,10 +169,8 @@ class Recorder:
             return
         try:
             self._log.metadata("units", {"/force/sample reading": force})
-        except LogError:
-            self.log_failed = True
-            if not self.best_effort:
-                raise
+        except LogError as error:
+            self._lost(error)
 
     def phase(self, fields: Mapping[str, object]) -> None:
         """Write the beginning of an action."""
@@ -187,10 +186,8 @@ class Recorder:
             return
         try:
             free = self._log.tick(now)
-        except LogError:
-            self.log_failed = True
-            if not self.best_effort:
-                raise
+        except LogError as error:
+            self._lost(error)
             return
         if free is None or free >= space.WARN_FREE:
             return
@@ -199,7 +196,9 @@ class Recorder:
             self._told_of_space = True
             self.event("warning", "log", f"{left}; the run ends when it is less than {space.LEAST_FREE / 1e6:.0f} MB")
         if free < space.LEAST_FREE and not self.best_effort:  # the log itself is sound and can be finished
-            raise LogError(self._log.path, left, "The run ended before the disk was full. Free some space.")
+            full = LogError(self._log.path, left, "The run ended before the disk was full. Free some space.")
+            full.exit_code = FaultError.exit_code
+            raise full
 
     def _write(self, topic: str, t: float, *, about: float | None = None, **fields: object) -> None:
         """The first error of the log ends the run; after it the way to the safe state goes on unrecorded."""
@@ -209,7 +208,12 @@ class Recorder:
         about_ns = epoch_ns(t if about is None else about)
         try:
             self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), about_ns)
-        except LogError:
-            self.log_failed = True
-            if not self.best_effort:
-                raise
+        except LogError as error:
+            self._lost(error)
+
+    def _lost(self, error: LogError) -> None:
+        """A log that fails is a fault of the rig; on the way to the safe state it is no reason to stop."""
+        self.log_failed = True
+        if not self.best_effort:
+            error.exit_code = FaultError.exit_code
+            raise error

@@ -91,7 +91,9 @@ def _is_complete(log: Log) -> bool:
 
 def _report(log: Log) -> list[str]:
     lines = [f"{sum(log.topics.values())} messages on {len(log.topics)} topics recovered."]
-    lines += [f"{printable(topic)}: {n} messages left out, they are not of this program" for topic, n in log.unknown.items()]
+    lines += [
+        f"{printable(topic)}: {n} messages left out, they are not of this program" for topic, n in log.unknown.items()
+    ]
     if _is_complete(log):
         return [*lines, "Nothing is missing."]
     lines += [f"bytes {gap.start} to {gap.end}: {gap.reason}" for gap in log.gaps]

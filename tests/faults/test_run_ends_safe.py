@@ -181,6 +181,7 @@ def test_a_full_disk_ends_the_run_and_leaves_a_readable_log(tell: Tell, monkeypa
 
     story = tell(fill_the_disk)
     assert isinstance(story.error, LogError) and "No space left" in story.outcome.reason
+    assert story.error.exit_code == 4
     assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S
     kept = read_log(story.log.with_name("run.mcap.part"))
     assert [gap.reason for gap in kept.gaps] == ["the file ends here without its end record"]
@@ -200,6 +201,7 @@ def test_a_disk_that_is_nearly_full_ends_the_run_with_a_finished_log(
 
     story = tell(lambda bench, stop: monkeypatch.setattr(space, "free", lambda folder: space.LEAST_FREE - 1))
     assert isinstance(story.error, LogError) and "32 MB left" in story.outcome.reason
+    assert story.error.exit_code == 4
     assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S + 1.0
     log = read_log(story.log)
     assert log.whole and log.outcome is not None and log.outcome["safe"] == "yes"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import random
@@ -230,6 +231,7 @@ FORCE = schema.encode("/force/sample", {"t_s": 0.0, "reading": 0.0, "force_N": 1
 GOOD = chunk(described() + message(FORCE))
 
 
+@functools.cache
 def bomb(size: int, of: bytes = bytes(1)) -> bytes:
     out = io.BytesIO()
     with zstandard.ZstdCompressor(level=1).stream_writer(out, closefd=False) as stream:

@@ -1,7 +1,8 @@
 """kill -9 of the process that records and of the process that writes, at random instants.
 
 Both run the code of a real run, but as forks of one process that has loaded it, with an engine that only makes up
-samples; and on a disk in memory, because how long a disk takes to confirm is not what is tested here.
+samples; and on a disk in memory, because how long a disk takes to confirm is not what is tested here. A witness that
+only sleeps and wakes tells how long this machine keeps a process waiting for its turn; that is allowed for.
 """
 
 import json
@@ -18,7 +19,7 @@ from rig.log.errors import LogError
 from rig.log.reader import read_log
 
 # Forks an engine and a writer for every case, ten cases at a time, and kills one of the two. The engine notes in
-# shared memory when it handed each sample over.
+# shared memory when it handed each sample over, the witness when it woke.
 NURSERY = """
 import json, mmap, os, signal, socket, struct, sys, time
 from pathlib import Path
@@ -47,6 +48,16 @@ def engine(path, end, handed):
         os._exit(REFUSED)
 
 
+def witness(woken):
+    for n in range(100_000):
+        struct.pack_into("<q", woken, 8 * n, time.monotonic_ns())
+        time.sleep(0.01)
+
+
+def noted(shared):
+    return [t for t, in struct.iter_unpack("<q", shared) if t]
+
+
 def fork(work, *arguments):
     process = os.fork()
     if process == 0:
@@ -72,14 +83,19 @@ def wait(process):
 folder, victim, delays = Path(sys.argv[1]), sys.argv[2], json.loads(sys.argv[3])
 for first in range(0, len(delays), 10):
     batch = [(start(folder / f"{first + n}.mcap"), delay) for n, delay in enumerate(delays[first : first + 10])]
-    began, results = time.monotonic(), {}
+    woken = mmap.mmap(-1, 8 * 100_000)
+    watching = fork(witness, woken)
+    began = time.monotonic()
     for n, ((processes, handed), delay) in sorted(enumerate(batch), key=lambda item: item[1][1]):
         time.sleep(max(0.0, began + delay - time.monotonic()))
         at = time.monotonic_ns()
         os.kill(processes[victim], signal.SIGKILL)
         codes = {name: wait(process) for name, process in processes.items()}
-        times = [t for t, in struct.iter_unpack("<q", handed) if t]
-        print(json.dumps({"n": first + n, "at": at, "codes": codes, "times": times}), flush=True)
+        seen = [t for t in noted(woken) if at - 500_000_000 < t] + [time.monotonic_ns()]
+        late = max(b - a for a, b in zip(seen, seen[1:])) - 10_000_000
+        print(json.dumps({"n": first + n, "at": at, "codes": codes, "times": noted(handed), "late": late}), flush=True)
+    os.kill(watching, signal.SIGKILL)
+    wait(watching)
 """
 
 
@@ -105,7 +121,7 @@ def kill(folder, victim, count, allowed_s):
     with subprocess.Popen([sys.executable, "-c", NURSERY, folder, victim, delays], stdout=subprocess.PIPE) as nursery:
         cases = [json.loads(line) for line in nursery.stdout]
     assert nursery.returncode == 0 and len(cases) == count
-    lost_ms = []
+    lost_ms, late_ms = [], []
     for case in cases:
         times = np.array(case["times"])
         try:
@@ -123,12 +139,15 @@ def kill(folder, victim, count, allowed_s):
             assert log.ended == (victim == "engine") and log.outcome is None
         lost = times[saved:]
         lost_ms.append(1e-6 * (case["at"] - lost[0]) if len(lost) else 0.0)
+        late_ms.append(1e-6 * case["late"])
         # the survivor: the writer ends in order, the engine is told at its next turn
         assert case["codes"] == {victim: -signal.SIGKILL, "writer" if victim == "engine" else "engine": 0} | (
             {"engine": 7} if victim == "writer" else {}
         )
-    print(f"{count} kills of the {victim}: lost at most {max(lost_ms):.0f} ms, median {np.median(lost_ms):.0f} ms")
-    assert max(lost_ms) <= 1e3 * allowed_s
+    print(f"{count} kills of the {victim}: lost at most {max(lost_ms):.0f} ms, median {np.median(lost_ms):.0f} ms; "
+          f"the machine was late by {np.median(late_ms):.0f} ms, at most {max(late_ms):.0f} ms")  # fmt: skip
+    # the way of a sample to the file has three turns: the engine's, the writer's, and that of its chunk
+    assert (np.array(lost_ms) <= 1e3 * allowed_s + 3 * np.array(late_ms)).all()
 
 
 COUNTS = [pytest.param(10, id="some"), pytest.param(200, id="many", marks=pytest.mark.slow)]

@@ -18,6 +18,7 @@ from rig.log.reader import read_log
 from rig.log.recover import recover
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks processes up in /proc")]
+SOON_NS = 2 * 10**9  # the exact bounds are tested with an engine that keeps account
 PROTOCOL = Path(str(files("sim_fixtures"))) / "protocols" / "short.toml"
 
 
@@ -80,7 +81,7 @@ def test_kill_of_the_engine(run):
         time.sleep(0.05)
     log = read_log(part)
     assert log.ended and log.gaps == () and log.outcome is None and "cut" in log.metadata
-    assert log.end_ns > killed_ns - 500_000_000  # the exact bound is tested with an engine that keeps account
+    assert log.end_ns > killed_ns - SOON_NS
     check_samples(log)
     assert recover(part, part.with_name("saved.mcap")).exit_code == 3
 
@@ -91,10 +92,10 @@ def test_kill_of_the_writer(run):
     killed_ns = time.time_ns()
     os.kill(writer_of(part), signal.SIGKILL)
     _, err = engine.communicate(timeout=60)
-    assert engine.returncode == 1, err
+    assert engine.returncode == 4, err
     assert "the process that writes the log has ended" in err and "high voltage off, measured" in err
     log = read_log(part)
     assert not log.ended and log.gaps[-1].reason.startswith("the file ends")
-    assert log.end_ns > killed_ns - 500_000_000
+    assert log.end_ns > killed_ns - SOON_NS
     check_samples(log)
     assert recover(part, part.with_name("saved.mcap")).exit_code == 3
