@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -363,6 +364,7 @@ class CiA404:
         self._layout = Layout((), channel)
         self._stream: Stream | None = None
         self._emergency = 0
+        self._inbox: deque[CanFrame] = deque()
         self._next_poll = -math.inf
 
     @property
@@ -392,14 +394,15 @@ class CiA404:
 
     def poll(self, now: float) -> Sequence[ForceSample]:
         self._next_poll = now + LOST_AGAIN_S
-        frames = self._link.read()
+        self._inbox.extend(self._link.read())
         if self._stream is None and self._dialogue.idle:
-            frames = []
+            self.counters["ignored_frames"] += len(self._inbox)  # they belong to an earlier conversation
+            self._inbox.clear()
             self._link.write(nmt(self._node, "pre-operational"))
             self._dialogue.begin(self._set_up())
         arrived: list[ForceSample] = []
-        for frame in frames:
-            match self._decoder.feed(frame):
+        while self._inbox:  # an error that an answer brings on leaves the others for the next poll
+            match self._decoder.feed(self._inbox.popleft()):
                 case None:
                     pass
                 case ProcessData(data):

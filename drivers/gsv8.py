@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -352,6 +353,7 @@ class GSV8:
         self._limit = _UNKNOWN_RANGE_LIMIT
         self._stream: Stream | None = None
         self._fresh = True
+        self._inbox: deque[Message] = deque()
         self._next_poll = -math.inf
 
     @property
@@ -390,7 +392,9 @@ class GSV8:
             self._decoder.expect_any()
             self._dialogue.begin(self._set_up())
         arrived: list[ForceSample | None] = []
-        for message in self._decoder.feed(data):
+        self._inbox.extend(self._decoder.feed(data))
+        while self._inbox:  # an error that an answer brings on leaves the others for the next poll
+            message = self._inbox.popleft()
             if isinstance(message, Measured) and self._stream is not None:
                 arrived.append(self._sample(message))
             elif not self._dialogue.offer(message, now):

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
@@ -430,6 +431,7 @@ class IsegEDCP:
         self._channels = 1
         self._ready = self._lost_settings = False
         self._commands = 0
+        self._inbox: deque[CanFrame] = deque()
         self._samples: list[HVSample] = []
         self._next_survey = -math.inf
         self._next_poll = -math.inf
@@ -543,8 +545,9 @@ class IsegEDCP:
 
     def poll(self, now: float) -> Sequence[HVSample]:
         self._next_poll = now + LOST_AGAIN_S
-        for frame in self._link.read():
-            message = self._decoder.feed(frame)
+        self._inbox.extend(self._link.read())
+        while self._inbox:  # an error that an answer brings on leaves the others for the next poll
+            message = self._decoder.feed(self._inbox.popleft())
             if isinstance(message, LogOn):
                 self.counters["log_ons"] += 1
                 self._link.write(log_on(self._module))

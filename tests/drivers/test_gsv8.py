@@ -630,6 +630,35 @@ def test_a_flipped_bit_outside_the_value_costs_the_frame_or_shows_as_a_flag() ->
             assert bit < 4
 
 
+def flipped_bits(count: int, seed: int) -> None:
+    """One bit turned over in each frame, outside the value itself: never a value that was not sent, and all counted."""
+    rng = random.Random(seed)
+    decoder = Decoder()
+    decoder.expect("float32", 8)
+    idle = bytes(28)
+    fed = good = 0
+    for _ in range(count // 100):
+        sent = [rng.uniform(-3.5, 3.5) for _ in range(100)]
+        frames = [bytearray(b"\xaa\x17\xb0" + struct.pack(">f", value) + idle + b"\x85") for value in sent]
+        for frame in frames:
+            at = int(rng.random() * 32)
+            frame[at if at < 3 else at + 4] ^= 1 << int(rng.random() * 8)
+        wire = b"".join(frames)
+        cut = int(rng.random() * len(wire))
+        fed += len(wire)
+        messages = decoder.feed(wire[:cut]) + decoder.feed(wire[cut:])
+        truth = {struct.pack(">f", value) for value in sent}
+        for message in messages:
+            assert isinstance(message, Measured) and struct.pack(">f", message.values[0]) in truth
+        good += len(messages)
+        # Every byte is in a frame that was read, dropped and counted, or still waiting for the rest of its frame.
+        assert fed == 36 * good + decoder.counters["dropped_bytes"] + len(decoder._buffer)
+        decoder.feed(bytes(70))  # so that no frame reaches into the next round
+        fed += 70
+    assert 0.8 * count < good < 0.95 * count  # 28 of 32 places are in the other channels' values
+    assert decoder.counters["bad_frames"] > 0.02 * count
+
+
 def random_bytes(count: int, seed: int) -> None:
     """Noise, rich in bytes that matter; the driver stays in its error family and invents next to nothing."""
     rng = random.Random(seed)
@@ -649,6 +678,16 @@ def random_bytes(count: int, seed: int) -> None:
 
 def test_faults_of_the_line() -> None:
     decode_mutations(30_000, seed=1)
+
+
+def test_flipped_bits() -> None:
+    flipped_bits(20_000, seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_million_flipped_bits() -> None:
+    flipped_bits(1_000_000, seed=2)
 
 
 def test_noise() -> None:
