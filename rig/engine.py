@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
 SETUP_LIMIT_S = 15.0
+SNAPSHOT_S = 1.0  # before and after what ended a run under voltage: the log holds every sample of it, and says where
 OUTPUT_LIMIT_S = 3.0  # how long a supply may take after set-up to be measured off
 
 
@@ -239,9 +240,13 @@ class Engine:
             reason = str(error) if known else f"internal error: {error!r}"
             if self._doing:
                 error.add_note(f"It happened during {self._doing}.")
+        ended = self.clock.now()
+        snapshot = status in ("limit", "fault") and self.guard is not None and self.guard.commanded
         rest = Teardown(self.bench, self.guard, self.recorder, self.control).run(
-            reason, error is None or _lets_ramp_down(error), self._next_turn
+            reason, error is None or _lets_ramp_down(error), self._next_turn, ended + SNAPSHOT_S if snapshot else ended
         )
+        if snapshot:
+            self.recorder.snapshot(reason, ended, SNAPSHOT_S, SNAPSHOT_S)
         for role, device in self.bench.devices.items():
             counted = ", ".join(f"{key}={value}" for key, value in sorted(device.counters.items()) if value)
             self.recorder.event("info", role, f"counted: {counted or 'nothing'}")

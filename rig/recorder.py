@@ -165,10 +165,19 @@ class Recorder:
 
     def units(self, force: str) -> None:
         """Write the unit of what has none in its name: the readings of the force sensor."""
+        self._metadata("units", {"/force/sample reading": force})
+
+    def snapshot(self, cause: str, at: float, before: float, after: float) -> None:
+        """Mark the seconds around what went wrong: every sample of theirs is in the log."""
+        self.event("info", "engine", f"snapshot from {at - before:.3f} to {at + after:.3f} s")
+        times = {"at_s": at, "from_s": max(at - before, 0.0), "to_s": at + after}
+        self._metadata("snapshot", {"cause": cause, **{key: f"{value:.3f}" for key, value in times.items()}})
+
+    def _metadata(self, name: str, table: Mapping[str, str]) -> None:
         if self.log_failed:
             return
         try:
-            self._log.metadata("units", {"/force/sample reading": force})
+            self._log.metadata(name, table)
         except LogError as error:
             self._lost(error)
 

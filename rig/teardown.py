@@ -46,11 +46,12 @@ class Teardown:
         self._failed: set[str] = set()  # roles that did not answer when last asked
         self._again = dict.fromkeys(bench.devices, -math.inf)
 
-    def run(self, cause: str, orderly: bool, next_turn: Callable[[float], float]) -> Rest:
+    def run(self, cause: str, orderly: bool, next_turn: Callable[[float], float], listen_until: float) -> Rest:
         """Stop the stage, take the voltage off, and wait until both have been measured.
 
         An orderly end ramps down; otherwise the output is taken off at once. A second signal, a supply that fails,
-        or a ramp that takes too long turn the ramp into an emergency off.
+        or a ramp that takes too long turn the ramp into an emergency off. What the instruments say is recorded until
+        ``listen_until`` at least, unless the operator is in a hurry.
         """
         clock, guard = self._bench.clock, self._guard
         self._recorder.best_effort = True
@@ -62,7 +63,8 @@ class Teardown:
         while self._bench.devices:
             now = self._recorder.turn = clock.now()
             self._control.poll(now)
-            if commanded and not hastened and (self._control.count >= 2 or "hv" in self._failed or now >= end):
+            late = now >= end and not self._safe()
+            if commanded and not hastened and (self._control.count >= 2 or "hv" in self._failed or late):
                 hastened, end = True, now + AT_ONCE_S
                 self._off(f"{cause}; hastened", at_once=True)
             for role in sorted(self._bench.devices, key=lambda role: role != "hv"):
@@ -72,7 +74,9 @@ class Teardown:
                         self._off(f"{cause}; again", at_once=True)
                     elif role == "stage":
                         self._stop_stage()
-            if (self._safe() and self._standing()) or (now >= end and (hastened or not commanded)):
+            heard = now >= listen_until or self._control.count >= 2
+            given_up = now >= end and (hastened or not commanded or self._safe())
+            if given_up or (heard and self._safe() and self._standing()):
                 break
             self._recorder.tick(now)
             clock.sleep_until(next_turn(now))

@@ -25,6 +25,7 @@ AnyGuard: TypeAlias = "Guard | RemoteGuard"  # in the engine's process, or in on
 
 SAFE_VOLTAGE = 60.0  # V; below this the discharge is harmless (EN 50191 names 60 V DC)
 DEVIATION_V, DEVIATION_PART = 50.0, 0.05  # a settled output this far from its set-point has sagged or risen ...
+AWAY_V = 3.0  # ... and so has one on its way that moves away from there by more than this from sample to sample ...
 DEVIATION_SAMPLES = 2  # ... when this many samples in a row say so
 FROZEN_SAMPLES = 25  # this many equal measurements of voltage and current in a row: last digits are never so quiet
 FROZEN_RAMP_V, FROZEN_RAMP_SAMPLES = 100.0, 3  # nor does a ramp over so much leave so many voltages equal
@@ -297,7 +298,7 @@ class Guard:
             When voltage or current is outside its limit, or the supply reports a trip while live; and when the
             monitor is frozen, whoever takes the voltage down.
         """
-        self.last = sample
+        before, self.last = self.last, sample
         below = abs(sample.voltage) < SAFE_VOLTAGE  # False for NaN
         self._low_samples = self._low_samples + 1 if below else 0
         if self.commanded and not below:
@@ -311,7 +312,7 @@ class Guard:
         faults = sample.flags & TRIP
         if faults:
             raise FaultError(f"hv: the supply reports {flag_names(faults)}.")
-        self._judge_deviation(sample)
+        self._judge_deviation(sample, before)
 
     def _judge_frozen(self, sample: HVSample) -> None:
         """A monitor that shows the very same for too long, or while the output must be moving, tells nothing any more.
@@ -358,18 +359,22 @@ class Guard:
                 f"most {allowed * 1e6:.3g} uA."
             )
 
-    def _judge_deviation(self, sample: HVSample) -> None:
-        """The output must be on, at the set-point that was asked for; two samples in a row that say no are a fault."""
+    def _judge_deviation(self, sample: HVSample, before: HVSample | None) -> None:
+        """The output must be on, at the set-point that was asked for or on its way there; two samples in a row that
+        say no are a fault."""
         on = HVFlag.ON in sample.flags
         self._seen_on = self._seen_on or on
-        settled = on and HVFlag.RAMPING not in sample.flags and not self._supply.busy
+        heard = on and not self._supply.busy
+        settled = heard and HVFlag.RAMPING not in sample.flags
         allowed = max(DEVIATION_V, DEVIATION_PART * self.setpoint)
+        missing = abs(sample.voltage - self.setpoint)
+        goes_away = before is not None and missing > abs(before.voltage - self.setpoint) + AWAY_V
         problem = ""
         if self._seen_on and not on:
             problem = "the supply says that it is off, and nobody switched it off from here"
         elif settled and not math.isclose(sample.setpoint, self.setpoint, rel_tol=1e-3, abs_tol=1.0):
             problem = f"its set-point is {sample.setpoint:.0f} V, and {self.setpoint:.0f} V were asked for from here"
-        elif settled and not abs(sample.voltage - self.setpoint) <= allowed:
+        elif (settled or (heard and goes_away)) and not missing <= allowed:
             word = "sagged" if sample.voltage < self.setpoint else "risen"
             problem = f"the output has {word} to {sample.voltage:.0f} V with {self.setpoint:.0f} V set"
         self._deviating_samples = self._deviating_samples + 1 if problem else 0

@@ -199,10 +199,19 @@ def test_an_output_that_is_not_where_it_was_sent_is_a_fault_at_the_second_sample
     guard.on_sample(sample(1000.0, HVFlag.ON))
     guard.on_sample(bad)
     guard.on_sample(sample(1000.0, HVFlag.ON))
-    guard.on_sample(sample(700.0, HVFlag.ON | HVFlag.RAMPING))  # on its way somewhere
+    guard.on_sample(sample(998.0, HVFlag.ON | HVFlag.RAMPING))  # on its way
     guard.on_sample(bad)
     with pytest.raises(FaultError, match=words):
         guard.on_sample(bad)
+
+
+def test_an_output_that_ramps_away_from_its_set_point_is_a_fault_at_the_second_sample() -> None:
+    guard, _, _ = live()
+    for voltage in (0.0, 500.0, 1000.0):
+        guard.on_sample(sample(voltage, HVFlag.ON | HVFlag.RAMPING))
+    guard.on_sample(sample(940.0, HVFlag.ON | HVFlag.RAMPING))
+    with pytest.raises(FaultError, match="sagged to 880 V"):
+        guard.on_sample(sample(880.0, HVFlag.ON | HVFlag.RAMPING))
 
 
 def test_off_counts_anew_after_every_command() -> None:
