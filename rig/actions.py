@@ -20,7 +20,7 @@ from rig.calibrate.steps import CALIBRATION
 from rig.control import Question
 from rig.errors import FaultError, LimitError
 from rig.plan import Action
-from rig.safety.guard import SAFE_VOLTAGE, GuardState
+from rig.safety.guard import SAFE_VOLTAGE, TRIP, GuardState, flag_names
 from rig.watch import check_zero
 
 if TYPE_CHECKING:
@@ -306,9 +306,22 @@ def confirm_voltage(engine: Engine) -> Turns:
     if engine.arming.allows(highest):
         return
     engine.arming.withdraw()
+    yield from _clear_faults(engine)
     words = f"High voltage up to {highest:g} V. Lid closed, interlock closed, nobody touching the specimen?"
     said = yield from engine.ask(Question(words, expected=f"{highest:g}"))
     engine.arming.confirm(highest, f"{said}")
+
+
+def _clear_faults(engine: Engine) -> Turns:
+    """What the supply has latched (an earlier emergency off, a trip) is cleared only when the operator says so."""
+    guard = engine.guard
+    if guard is None or guard.last is None or not guard.last.flags & TRIP:
+        return
+    words = f"hv: the supply has latched: {flag_names(guard.last.flags & TRIP)}. Cause found and removed?"
+    said = yield from engine.ask(Question(words, expected="clear"))
+    guard.clear_faults(str(said))
+    last = guard.last
+    yield from _wait(engine, lambda: guard.last is not last and guard.last is not None, GRACE_S, "A new measurement")
 
 
 def choose_about_live_output(engine: Engine) -> Turns:

@@ -179,6 +179,18 @@ class Guard:
             self._supply.set_ramp(self._ramp)
             self._supply.switch_off()
 
+    def clear_faults(self, cause: str) -> None:
+        """Clear what the supply has latched, an earlier emergency off for one, by the operator's choice; leaves it off.
+
+        Raises
+        ------
+        FaultError
+            When the output is live or unmeasured; nothing is changed then.
+        """
+        self.check_off()
+        self._tell("clear", cause)
+        self._supply.clear()
+
     def request(self, volts: float, h: float) -> None:
         """Ramp the output to ``volts`` with the disk at displacement ``h`` metres.
 

@@ -211,6 +211,9 @@ class RemoteGuard:
         self.commanded = True
         self._call("take_down", cause)
 
+    def clear_faults(self, cause: str) -> None:
+        self._call("clear_faults", cause)
+
     def request(self, volts: float, h: float) -> None:
         self._call("request", volts, h)
 

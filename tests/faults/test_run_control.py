@@ -212,3 +212,20 @@ def test_a_supply_found_live_is_left_alone_while_the_operator_thinks_and_when_he
     story = tell(control=Control([Operator(script)]), replace=LIVE)
     assert isinstance(story.error, Stopped) and not story.outcome.safe
     assert story.final_output == pytest.approx(500, abs=5) and not story.control_words and not story.stage_words[:-1]
+
+
+def test_what_the_supply_has_latched_is_cleared_only_when_the_operator_says_so(tell: Tell) -> None:
+    """An interlock that was open for a moment before the run, and is closed again."""
+    asked: list[str] = []
+
+    def script(control: Control) -> list[str]:
+        if control.question is not None and control.answer is None:
+            asked.append(control.question.text)
+        return answers(control)
+
+    open_once = '[[simulation.fault]]\nrole = "hv"\nkind = "inhibit"\nat_s = 0.1\nduration_s = 0.2\n'
+    story = tell(control=Control([Operator(script)]), replace=("[simulation.film]", f"{open_once}[simulation.film]"))
+    assert asked, story.outcome.reason
+    assert "the supply has latched: inhibited" in asked[0] and asked[1].startswith("High voltage up to 1000 V")
+    assert story.control_words[:2] == ["clear", "arm"]
+    assert story.outcome.status == "complete", story.outcome.reason
