@@ -46,7 +46,17 @@ AGAIN_S = 0.1  # a command that failed is given again at this interval
 INSIST_S = 1.0  # an off that was sent but is not measured is sent again at this interval
 TRY_S = 20.0  # how long a supply that does not obey is told again after the engine has gone
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
-MAY_BE_CALLED = ("arm", "check_supply", "check_off", "request", "check_move", "take_down", "clear_faults", "ramp_off", "kill")
+MAY_BE_CALLED = (
+    "arm",
+    "check_supply",
+    "check_off",
+    "request",
+    "check_move",
+    "take_down",
+    "clear_faults",
+    "ramp_off",
+    "kill",
+)
 
 
 def config(scene: Scene, clock: RealClock) -> bytes:

@@ -223,9 +223,9 @@ def test_what_the_supply_has_latched_is_cleared_only_when_the_operator_says_so(t
             asked.append(control.question.text)
         return answers(control)
 
-    open_once = '[[simulation.fault]]\nrole = "hv"\nkind = "inhibit"\nat_s = 0.1\nduration_s = 0.2\n'
+    open_once = '[[simulation.fault]]\nrole = "hv"\nkind = "inhibit"\nduration_s = 0.01\n'
     story = tell(control=Control([Operator(script)]), replace=("[simulation.film]", f"{open_once}[simulation.film]"))
-    assert asked, story.outcome.reason
+    assert story.outcome.status == "complete", story.outcome.reason
     assert "the supply has latched: inhibited" in asked[0] and asked[1].startswith("High voltage up to 1000 V")
     assert story.control_words[:2] == ["clear", "arm"]
     assert story.outcome.status == "complete", story.outcome.reason
