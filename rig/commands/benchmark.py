@@ -40,6 +40,15 @@ def benchmark_extremes(full: bool, out: Path) -> None:
     _benchmark(extremes.run, extremes.render, "extremes", full, out)
 
 
+@benchmark.command("fit")
+@_benchmark_options
+def benchmark_fit(full: bool, out: Path) -> None:
+    """Error of the identified film against compute time and against the time of the rig."""
+    from rig.benchmark import fit
+
+    _benchmark(fit.run, fit.render, "fit", full, out)
+
+
 @benchmark.command("rates")
 @_benchmark_options
 def benchmark_rates(full: bool, out: Path) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from calibration.identify import identify, secant_modulus
 from model.materials import NAMED, Material
 from model.membrane import solve_many
 from rig import proposal
+from rig.benchmark.fit import simulated
 from rig.cli import main
 from rig.errors import ConfigError, LimitError
 from rig.experiment import certificates_of, prepare, run
@@ -118,28 +118,9 @@ def test_the_command_writes_the_protocol_and_never_over_another(tmp_path: Path) 
 
 
 def experiment(protocol: Protocol, seed: int) -> list[Curve]:
-    """What a run of ``protocol`` records of a one-term film, with noise and zeros as the certificates state them."""
+    """Of a one-term film; the fit starts from the scene's guess."""
     scene, _ = load_scene(SCENE)
-    random = np.random.default_rng(seed)
-    zero_f, zero_h = random.standard_normal(2)
-    made = []
-    specimen = scene.specimen.specimen()  # with the scene's guess, from which the fit starts
-    for curve in proposal.recorded(protocol, scene, certificates_of(scene, SCENE.parent), specimen):
-        grid = np.linspace(0.0, 13.5e-3, 200)
-        force = solve_many(
-            curve.specimen.with_material(ONE_TERM), grid, curve.nominal_voltage, wrinkling="tension_field"
-        )
-        known = np.isfinite(force.force)
-        exact = np.interp(curve.h, grid[known], force.force[known])
-        n = curve.h.size
-        made.append(
-            replace(
-                curve,
-                force=exact + curve.force_zero * zero_f + curve.force_noise * random.standard_normal(n),
-                h=curve.h + curve.displacement_zero * zero_h + curve.displacement_noise * random.standard_normal(n),
-            )
-        )
-    return made
+    return simulated(protocol, scene, certificates_of(scene, SCENE.parent), ONE_TERM, seed)
 
 
 @pytest.mark.slow
