@@ -59,13 +59,13 @@ def _devices(log: Log) -> list[str]:
 
 def _rates(log: Log) -> list[str]:
     lines = [f"{'topic':<24}{'messages':>10}{'missing':>10}{'rate / Hz':>12}{'longest pause / s':>20}"]
-    tables = log.tables(list(log.topics))
+    tables = log.tables([topic for topic in log.topics if topic.endswith("/sample")])
     for topic, count in log.topics.items():
-        t = np.sort(tables[topic]["t_s"])
-        steps = np.diff(t)
-        streams = topic.endswith("/sample") and steps.size > 0 and float(np.median(steps)) > 0
-        rate = f"{1.0 / float(np.median(steps)):12.2f}" if streams else f"{'-':>12}"
-        pause = f"{float(steps.max()):20.4f}" if streams else f"{'-':>20}"
+        rate, pause = f"{'-':>12}", f"{'-':>20}"
+        if topic in tables:
+            steps = np.diff(np.sort(tables[topic]["t_s"]))
+            if steps.size > 0 and float(np.median(steps)) > 0:
+                rate, pause = f"{1.0 / float(np.median(steps)):12.2f}", f"{float(steps.max()):20.4f}"
         lines.append(f"{topic:<24}{count:>10}{log.missing.get(topic, 0):>10}{rate}{pause}")
     lines += [f"{printable(topic):<24}{count:>10}  (not of this program)" for topic, count in log.unknown.items()]
     return lines

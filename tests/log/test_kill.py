@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -100,18 +101,11 @@ for first in range(0, len(delays), 10):
 
 
 @pytest.fixture
-def disk(tmp_path):
+def disk():
     """A folder in memory where the system has one."""
     shared = Path("/dev/shm")
-    if not shared.is_dir():
-        yield tmp_path
-        return
-    folder = shared / f"dea-rig-{tmp_path.parent.name}-{tmp_path.name}"
-    folder.mkdir()
-    yield folder
-    for path in folder.iterdir():
-        path.unlink()
-    folder.rmdir()
+    with TemporaryDirectory(prefix="dea-rig-", dir=shared if shared.is_dir() else None) as folder:
+        yield Path(folder)
 
 
 def kill(folder, victim, count, allowed_s):

@@ -1,7 +1,8 @@
-"""kill -9 in the middle of a whole ``dea-rig run`` over pseudo-terminals: of the engine, of the writer."""
+"""In the middle of a whole ``dea-rig run`` over pseudo-terminals: kill -9 of the engine, of the writer; a full disk."""
 
 import os
 import random
+import resource
 import signal
 import subprocess
 import sys
@@ -99,3 +100,16 @@ def test_kill_of_the_writer(run):
     assert log.end_ns > killed_ns - SOON_NS
     check_samples(log)
     assert recover(part, part.with_name("saved.mcap")).exit_code == 3
+
+
+@pytest.mark.parametrize("run", [4], indirect=True)
+def test_a_disk_that_takes_nothing_more(run):
+    engine, part = run
+    most = part.stat().st_size + 3000
+    resource.prlimit(writer_of(part), resource.RLIMIT_FSIZE, (most, most))
+    _, err = engine.communicate(timeout=60)
+    assert engine.returncode == 4, err
+    assert "writing failed (File too large)" in err and "high voltage off, measured" in err
+    log = read_log(part)
+    assert [gap.reason for gap in log.gaps] == ["the file ends here without its end record"]
+    check_samples(log)
