@@ -2,8 +2,9 @@
 
 It starts latched SAFE. Arming needs the operator's word and a supply that is measurably off; the first set-point
 makes it LIVE; any fault latches it SAFE again, and nothing but a new arming leads out of there. Connecting, reading
-and latching never raise an output. Software is not the safety function: the interlock loop, the emergency stop, the
-supply's own current limit and the bleed resistor are.
+and latching never raise an output. On real ports it lives in a process of its own (`rig.safety.process`); on a bench in
+memory in the engine's, by the same rules. In both it lives by the engine's heartbeats. Software is not the
+safety function: the interlock loop, the emergency stop, the supply's own current limit and the bleed resistor are.
 """
 
 from __future__ import annotations
