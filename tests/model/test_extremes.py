@@ -9,7 +9,7 @@ import warnings
 import numpy as np
 import pytest
 
-from model.limits import taut_limit
+from model.limits import slack_voltage
 from model.materials import NAMED, Material
 from model.membrane import Status, solve, solve_many
 from model.reference import reference
@@ -119,18 +119,19 @@ def grid(ratios: list[float], prestretches: list[float], heights: list[float], v
         material((1e9 / 3.0,), (6.0,)),
         material((1e2 / 2.0, 1e2 / 2.0), (2.0, 2.0 + 1e-7)),
     ]
-    films, h, v = [], [], []
+    made = []
     for number, (ratio, lp, m) in enumerate(itertools.product(ratios, prestretches, materials)):
-        thickness = (1e-6, 40e-6, 1e-3)[number % 3]
-        specimen = film(ratio, lp, m, thickness)
-        rows = np.array(heights) * B
-        limit = np.nan_to_num(taut_limit(specimen, rows, tolerance=1e-3).voltage, nan=1e3)
-        for row, volt in zip(rows, limit, strict=True):
-            for share in voltages:
-                films.append(specimen)
-                h.append(row)
-                v.append(share * volt)
-    return films, np.array(h), np.array(v)
+        specimen = film(ratio, lp, m, (1e-6, 40e-6, 1e-3)[number % 3])
+        made += [(specimen, height * B) for height in heights]
+    films, h = [specimen for specimen, _ in made], np.array([height for _, height in made])
+    low, high = np.zeros(len(made)), np.array([float(slack_voltage(*one)) for one in made])
+    for _ in range(10):
+        middle = 0.5 * (low + high)
+        taut = solve_many(films, h, middle, tolerance=1e-4).status == Status.TAUT
+        low, high = np.where(taut, middle, low), np.where(taut, high, middle)
+    limit = np.where(low > 0.0, low, 1e3)
+    rows = [(specimen, h, share * volt) for (specimen, h), volt in zip(made, limit, strict=True) for share in voltages]
+    return [row[0] for row in rows], np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
 
 
 def test_nothing_goes_unsaid() -> None:
