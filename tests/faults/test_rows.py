@@ -76,6 +76,8 @@ ROWS: dict[int, Row] = {
         "off within two samples, latched",
         [
             "faults/test_run_ends_safe.py::test_a_breakdown_takes_the_output_off_at_once",
+            "faults/test_limits.py::test_a_current_that_charging_does_not_explain_is_a_breakdown_within_two_samples",
+            "faults/test_limits.py::test_a_sagging_output_is_taken_off_within_two_samples",
             "faults/test_other_instruments.py::test_without_a_current_monitor_a_failing_film_shows_in_the_voltage",
             "faults/test_switches.py::test_ends_safe",
         ],
@@ -84,6 +86,9 @@ ROWS: dict[int, Row] = {
         "the field exceeds its limit by motion alone",
         "refused before voltage or displacement change; off when it is measured",
         [
+            "faults/test_limits.py::test_a_move_into_the_field_limit_is_refused_before_the_stage_moves",
+            "faults/test_limits.py::test_a_voltage_into_the_field_limit_is_refused_before_the_output_rises",
+            "faults/test_limits.py::test_a_film_that_is_moved_by_somebody_else_is_cut_off_at_its_field_limit",
             "rig/test_heartbeat.py::test_a_move_is_asked_for_and_a_voltage_is_held_against_where_it_leads",
             "rig/test_heartbeat.py::test_a_disk_that_moves_where_the_field_is_too_high_takes_the_output_off",
             "rig/test_guard.py::test_a_voltage_that_the_flat_film_bears_is_refused_on_the_stretched_one",
@@ -93,6 +98,8 @@ ROWS: dict[int, Row] = {
         "the force exceeds its limit; zeros are taken again and again",
         "the limit holds against the stored zero",
         [
+            "faults/test_limits.py::test_no_row_of_zero_steps_carries_the_force_limit_away",
+            "faults/test_limits.py::test_a_zero_far_from_the_stored_one_is_refused_though_its_reading_is_small",
             "faults/test_run_ends_safe.py::test_a_film_stiffer_than_believed_stops_at_the_force_limit",
             "faults/test_run_ends_safe.py::test_a_sensor_far_off_at_zero_is_refused",
         ],
@@ -101,6 +108,8 @@ ROWS: dict[int, Row] = {
         "a sensor is silent, frozen, saturated, without a value",
         "the stage stops and the voltage goes",
         [
+            "faults/test_limits.py::"
+            "test_without_fresh_data_the_stage_stops_within_two_periods_and_the_time_out_and_the_voltage_ramps_down",
             "faults/test_run_ends_safe.py::test_a_device_lost_or_silent_ends_the_run",
             "faults/test_switches.py::test_ends_safe",
             "faults/test_other_instruments.py::test_a_load_cell_that_fails_ends_the_run_off",
