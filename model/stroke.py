@@ -30,6 +30,7 @@ GROWTH = 1.2  # ... and how it grows from one to the next
 COARSE = 1e-6  # tolerance on the way to the bracket of the end
 CORRECTIONS = 5  # of a voltage that is nearly right
 ORDER = 16  # of the quadrature of the work
+NEAR = 1e-6  # of zero, a criterion that is reached
 INSIDE = 1e-5  # error of a peak field inside the film, which a parabola between points finds
 
 
@@ -437,9 +438,12 @@ def _close_in(actuators: list[Actuator], ways: list[_Way], criteria: Criteria, t
     there = state(h, np.arange(len(some)))
     excess, which = criteria.excess(there.film, there.voltage, shear)
     for k, way in enumerate(begin):
-        way.steepness = (at_high[k] - at_low[k]) / (high[k] - low[k]) if math.isfinite(at_high[k]) else math.inf
+        if h[k] > low[k]:
+            way.steepness = float((excess[k] - at_low[k]) / (h[k] - low[k]))
         way.h, way.voltage, way.excess = float(h[k]), float(there.voltage[k]), float(excess[k])
-        way.limit = Limit(int(which[k])) if math.isfinite(at_high[k]) else Limit.FILM
+        # Where no film was found further on, the criterion may still have ended the stroke before.
+        ended = math.isfinite(at_high[k]) or float(excess[k]) > -NEAR
+        way.limit = Limit(int(which[k])) if ended else Limit.FILM
 
 
 def _gather(

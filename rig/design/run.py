@@ -15,13 +15,14 @@ from model import design
 from model.design import Point, Treatment
 from model.limits import breakdown_voltage
 from model.membrane import Solution, solve, solve_many
+from model.optimise import optimise
 from model.profile import Profile
 from model.stroke import Limit, Strokes, strokes
+from rig.design import best, pictures
 from rig.design import compare as shooting
-from rig.design import pictures
 from rig.design.claims import Claims, judge
 from rig.design.output import claim_rows, map_rows, write_csv
-from rig.design.study import BoundaryStudy, MapStudy, ProfilesStudy, Study
+from rig.design.study import BoundaryStudy, MapStudy, OptimiseStudy, ProfilesStudy, Study
 from rig.design.tables import claim_tables, map_table
 from rig.errors import ConfigError
 from rig.outputs import check_new
@@ -68,6 +69,8 @@ def run_study(
         outcome = _profiles(study, out / name, progress)
     elif isinstance(study, BoundaryStudy):
         outcome = _boundary(study, out / name, progress)
+    elif isinstance(study, OptimiseStudy):
+        outcome = _best(study, out / name, executor, progress)
     else:
         outcome = _map(study, out / name, executor, progress, compare)
     outcome.files = files
@@ -285,3 +288,19 @@ def map_points(study: MapStudy) -> list[Point]:
     films = [study.film.film(a, lp) for lp in study.prestretches for a in study.disk_radii_mm]
     criteria = study.limits.criteria(study.film.known())
     return design.points(films, study.bias.recipes(study.cases), study.chosen(), criteria)
+
+
+# ---- the best actuator
+
+
+def _best(study: OptimiseStudy, path: Path, executor: Executor | None, progress: Progress) -> Outcome:
+    found = optimise(
+        best.task_of(study),
+        start=study.start,
+        front=study.front,
+        executor=executor,
+        progress=lambda share, what: progress(share, 1.0, what),
+    )
+    write_csv(path.with_suffix(".csv"), best.rows(found))
+    best.draw(found, study.title or path.name, path)
+    return Outcome(show=[best.table(found)])

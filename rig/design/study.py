@@ -171,8 +171,68 @@ class BoundaryStudy(Table):
     wrinkling: Literal["plain", "tension_field"] = "plain"
 
 
-Study = ProfilesStudy | MapStudy | BoundaryStudy
-_KINDS: dict[str, type[Study]] = {"profiles": ProfilesStudy, "map": MapStudy, "boundary": BoundaryStudy}
+Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+
+
+class BoundsTable(Table):
+    """Lowest and highest value of what may be varied; a variable left out stays as the study has it."""
+
+    radius_ratio: Range | None = None
+    prestretch: Range | None = None
+    thickness_um: Range | None = None
+    preload_N: Range | None = None
+    stiffness_N_per_mm: Range | None = None
+    weight_N: Range | None = None
+    spacer_mm: Range | None = None
+
+    def si(self) -> dict[str, tuple[float, float]]:
+        """By the model's names, in SI units."""
+        found = {}
+        for key, (name, scale) in VARIABLES.items():
+            bounds: list[float] | None = getattr(self, key)
+            if bounds is not None:
+                found[name] = (scale * bounds[0], scale * bounds[1])
+        return found
+
+
+VARIABLES = {  # key: name in the model, SI units in one unit of the key
+    "radius_ratio": ("radius_ratio", 1.0),
+    "prestretch": ("prestretch", 1.0),
+    "thickness_um": ("thickness", 1e-6),
+    "preload_N": ("preload", 1.0),
+    "stiffness_N_per_mm": ("stiffness", 1e3),
+    "weight_N": ("weight", 1.0),
+    "spacer_mm": ("spacer", 1e-3),
+}
+
+
+class OptimiseStudy(Table):
+    """The best actuator of one case within bounds, and the front of stroke against work."""
+
+    study: Literal["optimise"]
+    title: str = ""
+    film: FilmTable = FilmTable()
+    case: Case = "I"
+    disk_radius_mm: Positive = 4.0
+    prestretch: Stretch = 1.2
+    treatment: TreatmentName = "tension"
+    vary: BoundsTable
+    bias: BiasTables = BiasTables()
+    limits: LimitsTable = LimitsTable()
+    start: int = Field(default=64, ge=4, le=4096)
+    front: int = Field(default=5, ge=0, le=100)
+    # What `dea-rig fit -o` wrote: its material takes the film's place, and its uncertainties make the optimum robust.
+    fit: str | None = None
+    coverage: float = Field(default=2.0, gt=0.0, le=6.0)
+
+
+Study = ProfilesStudy | MapStudy | BoundaryStudy | OptimiseStudy
+_KINDS: dict[str, type[Study]] = {
+    "profiles": ProfilesStudy,
+    "map": MapStudy,
+    "boundary": BoundaryStudy,
+    "optimise": OptimiseStudy,
+}
 
 
 def load_study(path: Path) -> Study:
@@ -192,4 +252,7 @@ def load_study(path: Path) -> Study:
     if not isinstance(kind, str) or kind not in _KINDS:
         allowed = ", ".join(f'"{name}"' for name in _KINDS)
         raise ConfigError(f"{path}: this study file cannot be used.\n  study = {kind!r}: allowed are {allowed}.")
-    return validate(raw, _KINDS[kind], "study", str(path))
+    study = validate(raw, _KINDS[kind], "study", str(path))
+    if isinstance(study, OptimiseStudy) and study.fit is not None:  # named as seen from the study's folder
+        study = study.model_copy(update={"fit": str(path.parent / study.fit)})
+    return study

@@ -1,0 +1,129 @@
+"""Optimisation studies: the task from a study file and a fit, its tables, CSV rows and picture."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from model.design import Point, Treatment
+from model.materials import Material
+from model.optimise import Design, Optimum, Task, Uncertain
+from model.stroke import Limit
+from rig.design import pictures
+from rig.design.study import VARIABLES, OptimiseStudy
+from rig.errors import ConfigError
+from rig.toml_file import read_text
+
+
+def task_of(study: OptimiseStudy) -> Task:
+    """The task in SI units.
+
+    Raises
+    ------
+    ConfigError
+        When bounds, bias and film do not go together, or the fit cannot be used.
+    """
+    film = study.film.film(study.disk_radius_mm, study.prestretch)
+    uncertain = None
+    if study.fit is not None:
+        material, uncertain = read_fit(Path(study.fit), film.material, study.coverage)
+        film = film.with_material(material)
+    recipe = study.bias.recipes([study.case])[study.case]
+    criteria = study.limits.criteria(film.material)
+    point = Point(study.case, film, recipe, Treatment(study.treatment), criteria)
+    try:
+        return Task(point, study.vary.si(), uncertain)
+    except ValueError as error:
+        raise ConfigError(f"vary: {error}.") from None
+
+
+def read_fit(path: Path, known: Material, coverage: float) -> tuple[Material, Uncertain]:
+    """The film that was identified, with strength and largest stretch of the ``known`` one, and its covariance.
+
+    Raises
+    ------
+    ConfigError
+        When the file is no result of `dea-rig fit -o`.
+    """
+    try:
+        fit = json.loads(read_text(path, "fit"))
+        names = tuple(fit["parameters"])
+        values = {name: float(fit["quantities"][name]["value"]) for name in names}
+        deviation = np.array([float(fit["quantities"][name]["standard_uncertainty"]) for name in names])
+        correlation = np.array(fit["correlation"], dtype=float)
+        terms = range(1, int(fit["terms"]) + 1)
+        material = replace(
+            known,
+            name=f"{path.name}",
+            mu=tuple(values[f"mu{k}"] for k in terms),
+            alpha=tuple(values[f"alpha{k}"] for k in terms),
+            eps_r=values.get("eps_r", known.eps_r),
+        )
+        covariance = correlation * np.outer(deviation, deviation)
+        if covariance.shape != (len(names), len(names)) or not np.isfinite(covariance).all():
+            raise ValueError("its covariance is not complete")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: not a fit that an optimum can be made robust with: {error}.") from None
+    return material, Uncertain(names, covariance, coverage)
+
+
+def _row(kind: str, design: Design) -> dict[str, Any]:
+    row: dict[str, Any] = {"kind": kind}
+    for key, (name, scale) in VARIABLES.items():
+        if name in design.values:
+            row[key] = design.values[name] / scale
+    row |= {
+        "stroke_mm": 1e3 * design.stroke,
+        "stroke_error_mm": 1e3 * design.stroke_error,
+        "work_mJ": 1e3 * design.work,
+        "voltage_V": design.voltage,
+        "limit": Limit(design.limit).name,
+    }
+    if design.sure is not None:
+        row |= {
+            "sure_voltage_V": design.sure.voltage,
+            "sure_stroke_mm": 1e3 * design.sure.stroke,
+            "sure_work_mJ": 1e3 * design.sure.work,
+        }
+    return row
+
+
+def rows(found: Optimum) -> list[dict[str, Any]]:
+    """The best, the front, and all designs of the global start."""
+    best = [_row(f"largest {name}", design) for name, design in found.best.items()]
+    return best + [_row("front", one) for one in found.front] + [_row("start", one) for one in found.tried]
+
+
+def table(found: Optimum) -> Table:
+    """The front, from the largest work to the largest stroke."""
+    result = Table(
+        title="The front of stroke and work",
+        caption=f"{found.solved} designs solved. None in the table is beaten by another in both stroke and work.",
+    )
+    shown = [_row("", one) for one in found.front]
+    for heading in list(shown[0])[1:]:
+        result.add_column(heading, justify="left" if heading == "limit" else "right")
+    for row in shown:
+        result.add_row(*(f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in list(row.values())[1:]))
+    return result
+
+
+def draw(found: Optimum, title: str, path: Path) -> None:
+    """All designs, and the front."""
+    with pictures.drawing(path, 1, 1, 6.0, 4.0) as panels:
+        axes = panels[0, 0]
+        for some, look, name in (
+            (found.tried, {"marker": "o", "linestyle": "", "color": "#bbbbbb", "markersize": 4}, "global start"),
+            (found.front, {"marker": "D", "linestyle": "-", "color": "#0072B2", "markersize": 5}, "front"),
+        ):
+            x = [1e3 * one.counted("stroke") for one in some]
+            y = [1e3 * one.counted("work") for one in some]
+            axes.plot(x, y, label=name, **look)
+        sure = "sure " if found.front[0].sure is not None else ""
+        axes.set(xlabel=f"{sure}stroke / mm", ylabel=f"{sure}work / mJ", title=title, xlim=(0, None), ylim=(0, None))
+        axes.legend()
