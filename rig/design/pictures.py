@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ def drawing(path: Path, rows: int, columns: int, width: float, height: float, **
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from PIL import Image
 
     with matplotlib.rc_context(RC):
         figure, axes = pyplot.subplots(
@@ -38,7 +40,10 @@ def drawing(path: Path, rows: int, columns: int, width: float, height: float, **
         )
         try:
             yield axes
-            figure.savefig(path.with_suffix(".png"), dpi=150, facecolor="white")
+            buffer = BytesIO()
+            figure.savefig(buffer, dpi=150, facecolor="white")
+            # A palette keeps these few-coloured pictures small.
+            Image.open(buffer).convert("RGB").quantize(96).save(path.with_suffix(".png"), optimize=True)
             figure.savefig(path.with_suffix(".svg"), facecolor="white", metadata={"Date": None})
         finally:
             pyplot.close(figure)
