@@ -67,7 +67,7 @@ ROWS: dict[int, Row] = {
         "NOT SAFE, never safe; told again",
         [
             "faults/test_processes.py::test_engine_killed_with_a_supply_that_does_not_obey_is_called_not_safe",
-            "faults/test_run_ends_safe.py::test_a_supply_that_ignores_off_is_called_not_safe",
+            "faults/test_switches.py::test_the_run_ends_as_required",
             "faults/test_run_ends_safe.py::test_a_supply_that_does_not_hear_the_first_off_is_told_again",
         ],
     ),
@@ -79,7 +79,7 @@ ROWS: dict[int, Row] = {
             "faults/test_limits.py::test_a_current_that_charging_does_not_explain_is_a_breakdown_within_two_samples",
             "faults/test_limits.py::test_a_sagging_output_is_taken_off_within_two_samples",
             "faults/test_other_instruments.py::test_without_a_current_monitor_a_failing_film_shows_in_the_voltage",
-            "faults/test_switches.py::test_ends_safe",
+            "faults/test_switches.py::test_the_run_ends_as_required",
         ],
     ),
     8: (
@@ -110,8 +110,7 @@ ROWS: dict[int, Row] = {
         [
             "faults/test_limits.py::"
             "test_without_fresh_data_the_stage_stops_within_two_periods_and_the_time_out_and_the_voltage_ramps_down",
-            "faults/test_run_ends_safe.py::test_a_device_lost_or_silent_ends_the_run",
-            "faults/test_switches.py::test_ends_safe",
+            "faults/test_switches.py::test_the_run_ends_as_required",
             "faults/test_other_instruments.py::test_a_load_cell_that_fails_ends_the_run_off",
             "rig/test_heartbeat.py::test_a_loop_that_beats_on_old_data_is_ramped_down",
         ],
@@ -120,7 +119,7 @@ ROWS: dict[int, Row] = {
         "torn, merged, doubled, late replies; alerts between",
         "dropped and counted, never taken for another's",
         [
-            "faults/test_switches.py::test_tolerated",
+            "faults/test_switches.py::test_a_little_of_everything_is_tolerated",
             "faults/test_matrix.py::test_every_switch_is_met_as_required",
             "faults/test_other_instruments.py::test_lines_doubled_torn_and_late_change_nothing",
             "faults/test_other_instruments.py::test_damaged_answers_never_raise_the_voltage",
@@ -132,7 +131,7 @@ ROWS: dict[int, Row] = {
         [
             "drivers/test_serial_link.py::test_every_way_to_vanish_at_every_call",
             "drivers/test_can_link.py::test_slcan_that_vanishes_is_lost",
-            "faults/test_run_ends_safe.py::test_a_device_lost_or_silent_ends_the_run",
+            "faults/test_switches.py::test_the_run_ends_as_required",
         ],
     ),
     13: (
@@ -140,7 +139,7 @@ ROWS: dict[int, Row] = {
         "its position is unknown: it is not moved again until homed",
         [
             "faults/test_stage_and_laser.py::test_stage_that_restarts_in_the_middle_of_a_move_is_refused_until_homed",
-            "faults/test_switches.py::test_ends_safe",
+            "faults/test_switches.py::test_the_run_ends_as_required",
         ],
     ),
     14: (
