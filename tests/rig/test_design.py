@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -20,10 +21,11 @@ from model.baselines.shooting import Equations
 from model.design import Point, Row, Swept, Treatment, sweep
 from model.reference import reference
 from rig.cli import main
+from rig.design.best import task_of
 from rig.design.claims import Claims, judge
 from rig.design.compare import sample, shoot
 from rig.design.run import Curve, boundary, map_points, profile_curves, run_study
-from rig.design.study import BoundaryStudy, MapStudy, ProfilesStudy, load_study
+from rig.design.study import BoundaryStudy, MapStudy, OptimiseStudy, ProfilesStudy, load_study
 from rig.errors import ConfigError
 
 STUDIES = Path(__file__).parents[2] / "sim_fixtures" / "studies"
@@ -299,3 +301,51 @@ def test_bad_studies_are_refused_by_name(tmp_path: Path, text: str, complaint: s
     with pytest.raises(ConfigError) as caught:
         run_study(load_study(path), "bad", tmp_path / "out", None, lambda done, total, label: None)
     assert complaint in str(caught.value)
+
+
+def test_an_optimum_takes_film_and_covariance_from_a_fit(tmp_path: Path) -> None:
+    """The keys are those that `dea-rig fit -o` writes."""
+    fit = {
+        "terms": 1,
+        "parameters": ["mu1", "alpha1", "eps_r"],
+        "correlation": [[1.0, -0.9, 0.1], [-0.9, 1.0, 0.0], [0.1, 0.0, 1.0]],
+        "quantities": {
+            "mu1": {"value": 4.2e4, "standard_uncertainty": 900.0},
+            "alpha1": {"value": 5.4, "standard_uncertainty": 0.05},
+            "eps_r": {"value": 1.72, "standard_uncertainty": 0.04},
+        },
+    }
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    (tmp_path / "best.toml").write_text(
+        'study = "optimise"\ncase = "II"\nfit = "fit.json"\n[vary]\nprestretch = [1.0, 1.3]\nweight_N = [0.1, 0.5]\n'
+    )
+    study = load_study(tmp_path / "best.toml")
+    assert isinstance(study, OptimiseStudy)
+    task = task_of(study)
+    film = task.point.film.material
+    assert (film.mu, film.alpha, film.eps_r, film.breakdown_field) == ((4.2e4,), (5.4,), 1.72, 80e6)
+    assert task.bounds == {"prestretch": (1.0, 1.3), "weight": (0.1, 0.5)}
+    assert task.uncertain is not None
+    assert task.uncertain.deviation({"mu1": 1.0, "alpha1": 0.0, "eps_r": 0.0}) == pytest.approx(900.0)
+    both = task.uncertain.deviation({"mu1": 1.0, "alpha1": 900.0 / 0.05, "eps_r": 0.0})
+    assert both == pytest.approx(900.0 * math.sqrt(0.2))
+    with pytest.raises(ConfigError, match="preload is no quantity of a mass"):
+        task_of(study.model_copy(update={"vary": type(study.vary)(preload_N=[0.1, 1.0])}))
+    del fit["correlation"]
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    with pytest.raises(ConfigError, match="correlation"):
+        task_of(study)
+
+
+@pytest.mark.slow
+def test_optimum_from_its_file(tmp_path: Path) -> None:
+    study = tmp_path / "best.toml"
+    study.write_text('study = "optimise"\ncase = "II"\nstart = 4\nfront = 0\n[vary]\nprestretch = [1.0, 1.3]\n')
+    result = CliRunner().invoke(main, ["design", str(study), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    with (tmp_path / "out" / "best.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    top = {row["kind"]: row for row in rows}["largest stroke"]
+    assert float(top["stroke_mm"]) >= max(float(row["stroke_mm"]) for row in rows)
+    assert all(row["limit"] for row in rows)
+    assert (tmp_path / "out" / "best.png").stat().st_size > 1000
