@@ -134,7 +134,6 @@ class _Operator(Control):
     """The operator of the recorded run: wants again what he wanted then, at the same instants."""
 
     def __init__(self, recording: Recording) -> None:
-        super().__init__()
         outcome = recording.log.outcome or {}
         given = [row.fields for row in recording.rows if row.topic == "/command"]
         said = [
@@ -142,9 +141,15 @@ class _Operator(Control):
             for row in recording.rows
             if row.topic == "/event" and row.fields["source"] == "operator"
         ]
+        asked = [t for t, word in said if word == "asked"]
+        answered = [t for t, word in said if word == "answered"]
+        # Answers that came at once were given by nobody, and nobody was there to choose anything either.
+        nobody = len(asked) == len(answered) and all(
+            late - t < AT_ONCE_S for t, late in zip(asked, answered, strict=True)
+        )
+        super().__init__(unattended=AS_RECORDED if nobody else "")
         self.took_down = any((c["device"], c["command"]) == ("hv", "take_down") for c in given)
-        self._questions = deque(t for t, word in said if word == "asked")
-        self._answers = deque(t for t, word in said if word == "answered")
+        self._questions, self._answers = deque(asked), deque(answered)
         self._wishes = deque((t, word) for t, word in said if word in ("paused", "continues"))
         self._answer_at = math.inf
         self._stopped_by = outcome.get("reason", "").removeprefix("stopped by ")

@@ -29,6 +29,7 @@ PATIENCE_TURNS = 10  # how many turns a decision may come later than then before
 # The word in the log under which a supply's first call of each command stands.
 WORDS = {
     "set_ramp": ("arm", "take_down"),
+    "clear": ("clear",),
     "set_voltage": ("set_voltage",),
     "switch_on": ("switch_on",),
     "switch_off": ("switch_off",),
