@@ -28,8 +28,10 @@ if sys.platform == "win32":
 
     def _lock(fd: int) -> None:
         os.lseek(fd, 4096, os.SEEK_SET)  # beyond the text, which others may read
-        msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
-        os.lseek(fd, 0, os.SEEK_SET)
+        try:
+            msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
+        finally:
+            os.lseek(fd, 0, os.SEEK_SET)
 
     def _send(port: serial.Serial, data: bytes) -> int:
         return port.write(data) or 0

@@ -260,7 +260,8 @@ def _whole_run(path: Path, folder: Path, progress: Callable[[float], None]) -> R
             marks.append((clock.now(), process_time(), _processor_time(simulator)))
             progress(done / total)
 
-        experiment.run(experiment.prepare(path, protocol, ports), log_path, note)
+        consent = experiment.Consent(arm="a benchmark", answers="a benchmark")
+        experiment.run(experiment.prepare(path, protocol, ports), log_path, note, consent)
     elapsed, host, there = np.subtract(marks[-1], marks[0])
     log = read_log(log_path)
     tables = log.tables(["/force/sample", "/stage/sample", "/displacement/sample"])

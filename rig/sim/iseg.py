@@ -101,6 +101,11 @@ class IsegEDCP:
         """What a channel can give at most (A)."""
         return self.nominal_i
 
+    @property
+    def registered(self) -> bool:
+        """Whether a host has logged on; until then, and after a minute of silence, it announces itself."""
+        return self._registered
+
     def _power_up(self, t: float) -> None:
         limit = self.nominal_i * self._settings.current_limit_percent / 100
         self._channels = [_Channel(current_limit=limit) for _ in range(self._settings.channels)]

@@ -38,7 +38,10 @@ os._exit(0)  # its notifier thread would spin
 
 def test_it_logs_on_ramps_reads_and_switches_off(serve):
     served = serve("hv", hv={"module": 3})
+    supply = served.bench.instruments["hv"]
+    assert not supply.registered
     out = served.client(TOUR, served.server.ports["hv"]["can_channel"], "125000")
+    assert supply.registered  # the client logged on by itself; nobody else talks to the module
     on, ramping, constant_voltage = 1 << 3, 1 << 4, 1 << 7
     assert (out["channels"], out["nominal"], out["serial"]) == (1, 6000.0, 484_216)
     assert out["module"] & 0x7700 == 0x7700  # temperature, supply, module, safety loop, no ramp, no sum error

@@ -63,6 +63,16 @@ def test_files_and_tables_hold_the_same_numbers(report: rates.Report, tmp_path: 
 
 @posix
 @pytest.mark.slow
+def test_no_frame_of_some_thousands_is_lost_beside_stage_and_laser() -> None:
+    (row,) = rates.measure(8.0, whole_run=False).rows
+    assert row.lost == 0 and row.seconds >= 8.0
+    wanted = {polled.role: polled.wanted_Hz for polled in row.polled}
+    assert (rates.FORCE_HZ, wanted) == (1000.0, {"stage": 50.0, "displacement": 100.0})
+    assert all(polled.reached_Hz > 0 for polled in row.polled)
+
+
+@posix
+@pytest.mark.slow
 def test_a_whole_run_loses_nothing() -> None:
     _, row = rates.measure(1.0).rows
     assert row.what == rates.WHOLE_RUN
