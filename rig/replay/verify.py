@@ -211,7 +211,7 @@ class _Verifier:
             has_laser=scene.displacement is not None,
         )
         self._streams = {role: _Stream() for role in scene.instruments}
-        self._commands = _commands(self._bench)
+        self._commands = commands(self._bench)
         self._until = 0.0
 
     def run(self) -> Verification:
@@ -359,7 +359,7 @@ class _Verifier:
         return _Different(Difference(role, kind, stream.t, step, stream.offset, bytes(stream.since), recorded, decoded))
 
 
-def _commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]], None]]:
+def commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]], None]]:
     """What the commands of a log mean, by device and word."""
 
     def arm(values: Sequence[float]) -> None:

@@ -102,3 +102,19 @@ def test_the_film_is_identified(name):
     assert ("eps_r" in found) == (truth.eps_r is not None)
     if truth.eps_r is not None:
         assert found["eps_r"].value == pytest.approx(truth.eps_r, rel=expected.eps_r_relative_tolerance)
+
+
+def test_every_command_of_the_software_can_be_given_again():
+    """The words that guard and engine write into a log, looked up in their texts."""
+    import re
+    from inspect import getsource
+
+    from rig import actions, engine
+    from rig.replay.verify import commands
+    from rig.safety import guard
+
+    written = {("hv", word) for word in re.findall(r'_tell\("(\w+)"', getsource(guard))}
+    for module in (actions, engine):
+        written |= set(re.findall(r'\.command\("(\w+)", "(\w+)"', getsource(module)))
+    assert len(written) >= 10
+    assert written <= commands(None).keys()
