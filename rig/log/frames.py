@@ -31,6 +31,7 @@ class Unpacker:
 
     def __init__(self) -> None:
         self._buffer = bytearray()
+        self._problem = ""
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
         """Kind and body of the frames that are complete with ``data``.
@@ -38,22 +39,26 @@ class Unpacker:
         Raises
         ------
         ValueError
-            What came is not a frame; nothing after it can be understood.
+            What comes next is not a frame; nothing after it can be understood.
         """
         self._buffer += data
         found = []
         at, size = 0, len(self._buffer)
-        while size - at >= _HEAD.size:
+        while not self._problem and size - at >= _HEAD.size:
             crc, length, kind = _HEAD.unpack_from(self._buffer, at)
             if length > MOST:
-                raise ValueError(f"a frame of {length} bytes")
-            if size - at - _HEAD.size < length:
+                self._problem = f"a frame of {length} bytes"
+            elif size - at - _HEAD.size < length:
                 break
-            at += _HEAD.size
-            body = bytes(self._buffer[at : at + length])
-            if zlib.crc32(body, kind) != crc:
-                raise ValueError("a frame whose checksum does not match")
-            found.append((kind, body))
-            at += length
+            else:
+                at += _HEAD.size
+                body = bytes(self._buffer[at : at + length])
+                at += length
+                if zlib.crc32(body, kind) == crc:
+                    found.append((kind, body))
+                else:
+                    self._problem = "a frame whose checksum does not match"
+        if self._problem and not found:
+            raise ValueError(self._problem)
         del self._buffer[:at]
         return found

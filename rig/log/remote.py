@@ -139,7 +139,11 @@ class RemoteLog:
                     if frames.DONE in self._heard:
                         return
                     raise self._fail(*self._gone())
-                for kind, body in self._unpack.feed(data):
+                try:
+                    found = self._unpack.feed(data)
+                except ValueError as error:
+                    raise self._fail(f"the process that writes the log sends {error}", "") from None
+                for kind, body in found:
                     self._heard.add(kind)
                     if kind == frames.ALIVE:
                         (free,) = frames.FREE.unpack(body)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from rig.log import part_file
+from rig.log import frames, part_file
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.recover import recover
@@ -81,11 +81,14 @@ def recorded(tmp_path_factory):
             if k % 5 == 0:
                 log.tick(k * 1e-3)
                 time.sleep(0.005)
-        log.close()
+        log.tick(1.0)
+        assert not log._waiting
+        mine.setblocking(True)
+        mine.sendall(frames.pack(frames.FINISH, b"{}"))
         thread.join()
+        log.close()
     its.close()
     its_second.close()
-    path = path.with_name("a.mcap.part")
     assert path.read_bytes() == content
     assert read_log(path).topics == {"/force/sample": 1000, "/raw/force/rx": 1000}
     return Recorded(bytes(content), calls)
@@ -94,7 +97,7 @@ def recorded(tmp_path_factory):
 def test_the_disk_is_asked_to_confirm_in_the_right_places(recorded):
     names = [name for name, _, _ in recorded.calls]
     assert names[0] == "sync of folder"  # the new file's name, before anything is in it
-    assert names[-1] == "sync"
+    assert names[-3:] == ["sync", "rename", "sync of folder"]
     waiting = [written - confirmed for name, written, confirmed in recorded.calls if name == "sync"]
     assert len(waiting) > 8 and set(waiting) == {0}  # each confirms all that was written
     # between its beginning and its end, no two chunks are written without asking
@@ -165,6 +168,9 @@ def test_power_cuts(recorded, tmp_path, count):
         losses += len(found[0]) < 1000
         if n % 20 == 0 and promised[confirmed]:
             out = tmp_path / f"{n}.mcap"
-            assert recover(path, out).exit_code == (0 if content == recorded.content else 3)
+            code = recover(path, out).exit_code
+            # all data may be there, and only the summary behind them not
+            assert code == 3 or (code == 0 and [len(k) for k in found] == [1000, 1000])
+            assert code == 0 or content != recorded.content
             assert [k.tolist() for k in numbers(out)] == [k.tolist() for k in found]
     assert losses > count / 2

@@ -6,9 +6,11 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 
 import pytest
 
+from rig.log import frames
 from rig.log.errors import LogError
 from rig.log.process import LogProcess
 from rig.log.reader import read_log
@@ -201,3 +203,34 @@ def test_finish_waits_for_the_second_producer(tmp_path):
         second.close()
         log.finish({})
     assert read_log(tmp_path / "a.mcap").topics == {"/force/sample": 100}
+
+
+def test_frames_split_anywhere_and_a_flip_anywhere():
+    stream = b"".join(frames.pack(kind, bytes([kind]) * kind) for kind in (1, 2, 3))
+    whole = [(kind, bytes([kind]) * kind) for kind in (1, 2, 3)]
+    for at in range(len(stream) + 1):
+        unpack = frames.Unpacker()
+        assert unpack.feed(stream[:at]) + unpack.feed(stream[at:]) == whole
+    for at in range(len(stream)):
+        flipped = bytearray(stream)
+        flipped[at] ^= 0x10
+        unpack, found = frames.Unpacker(), []
+        with suppress(ValueError):  # none: it waits for the rest of a longer frame
+            for _ in range(2):
+                found += unpack.feed(bytes(flipped))
+                flipped.clear()
+        assert found == whole[: len(found)] and len(found) < 3
+
+
+def test_what_a_producer_sends_is_checked_by_the_writer(tmp_path):
+    """A frame that was damaged on its way ends the producer's part, not the log."""
+    with LogProcess(tmp_path / "a.mcap") as log:
+        end = os.dup(log.second.fileno())
+        with socket.socket(fileno=end) as second:
+            good = frames.pack(frames.METADATA, b'["note", {"a": "b"}]')
+            second.sendall(good + good[:-3] + b"xyz" + good)
+            record(log)
+            log.finish({})
+    found = read_log(tmp_path / "a.mcap")
+    assert found.whole and found.topics == {"/force/sample": 50}
+    assert found.metadata["note"] == {"a": "b"}
