@@ -68,7 +68,8 @@ def identity(name: str, version: str) -> Identity:
 class Codec:
     """Bytes to lines of printable ASCII. ``counters``: ``bad_grammar``, ``too_long``.
 
-    What follows a line that ended without CR is dropped as well: it may be the rest of a number that was torn in two.
+    What follows a line that ended without CR is dropped as well, until `asked`: it may be the rest of a number that was
+    torn in two.
     """
 
     def __init__(self, counters: dict[str, int] | None = None) -> None:
@@ -80,6 +81,10 @@ class Codec:
     def feed(self, data: bytes) -> list[str]:
         """The lines that ``data`` completes, in order."""
         return [line[:-1].decode("ascii") for line in self._lines.feed(data) if self._is_good(line)]
+
+    def asked(self) -> None:
+        """A question is sent: what comes from now on is no rest of an earlier line."""
+        self._torn = False
 
     def _is_good(self, line: bytes) -> bool:
         good = not self._torn and _LINE.fullmatch(line) is not None
@@ -237,6 +242,7 @@ class Shvps:
 
     def _send(self, request: str) -> Callable[[str], bool]:
         self._link.write(encode(request))
+        self._codec.asked()
         if request == "QVer":
             return lambda line: _VERSION.fullmatch(line) is not None
         if request == "QName":

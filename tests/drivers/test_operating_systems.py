@@ -40,8 +40,11 @@ ASKS = ("sys.platform", "os.name", "platform.system", "hasattr(")
 
 def used(path: Path) -> Iterator[tuple[str, bool]]:
     """(POSIX-only name, whether the block, function or class around it asks for the system) of one module."""
-    for block in ast.parse(path.read_text(encoding="utf-8")).body:
-        guarded = any(word in ast.unparse(block) for word in ASKS)
+    source = path.read_text(encoding="utf-8")
+    lines = source.splitlines()
+    for block in ast.parse(source).body:
+        text = "\n".join(lines[block.lineno - 1 : block.end_lineno])
+        guarded = any(word in text for word in ASKS)
         for node in ast.walk(block):
             match node:
                 case ast.Import(names):
