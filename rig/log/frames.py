@@ -27,11 +27,11 @@ def pack(kind: int, body: bytes) -> bytes:
 
 
 class Unpacker:
-    """Cuts a stream into frames."""
+    """Cuts a stream into frames; ``problem`` says what stands in it that is none, behind which nothing is read."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._problem = ""
+        self.problem = ""
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
         """Kind and body of the frames that are complete with ``data``.
@@ -44,10 +44,10 @@ class Unpacker:
         self._buffer += data
         found = []
         at, size = 0, len(self._buffer)
-        while not self._problem and size - at >= _HEAD.size:
+        while not self.problem and size - at >= _HEAD.size:
             crc, length, kind = _HEAD.unpack_from(self._buffer, at)
             if length > MOST:
-                self._problem = f"a frame of {length} bytes"
+                self.problem = f"a frame of {length} bytes"
             elif size - at - _HEAD.size < length:
                 break
             else:
@@ -57,8 +57,8 @@ class Unpacker:
                 if zlib.crc32(body, kind) == crc:
                     found.append((kind, body))
                 else:
-                    self._problem = "a frame whose checksum does not match"
-        if self._problem and not found:
-            raise ValueError(self._problem)
+                    self.problem = "a frame whose checksum does not match"
+        if self.problem and not found:
+            raise ValueError(self.problem)
         del self._buffer[:at]
         return found

@@ -47,12 +47,12 @@ class Producer:
             return []
         except OSError:
             data = b""
-        try:
-            self.open = bool(data)
-            return self._unpack.feed(data)
-        except ValueError:
-            self.open = False
-            return []
+        with suppress(ValueError):
+            found = self._unpack.feed(data)
+            self.open = bool(data) and not self._unpack.problem
+            return found
+        self.open = False
+        return []
 
     def say(self, kind: int, body: bytes = b"") -> None:
         """Send a frame unless the producer is gone or does not listen."""
