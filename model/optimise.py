@@ -201,51 +201,58 @@ def optimise(
     for k, objective in enumerate(_OBJECTIVES):
         progress(0.4 + 0.2 * k, f"largest {objective}")
         order = sorted(tried, key=lambda design: -design.counted(objective))
-        found = [search.climb(objective, np.array(design.shares)) for design in order[:BEST]]
-        best[objective] = max((*found, order[0]), key=lambda design: design.counted(objective))
-    between = []
+        for design in order[:BEST]:
+            search.climb(objective, np.array(design.shares))
+    # Where two limits meet the best is at a kink, where a search may pass it: every design counts that was met.
+    for objective in _OBJECTIVES:
+        best[objective] = max([*tried, *search.met], key=lambda design: design.counted(objective))
     low, high = best["work"].counted("stroke"), best["stroke"].counted("stroke")
     begin = np.array(best["work"].shares)
     for k in range(1, front + 1):
         progress(0.8 + 0.2 * (k - 1) / max(front, 1), "front")
         least = low + (high - low) * k / (front + 1)
         near = begin + (np.array(best["stroke"].shares) - begin) * k / (front + 1)
-        between.append(search.climb("work", near, least=least))
-    designs = [best["work"], *between, best["stroke"]]
-    return Optimum(best, undominated([*designs, *tried]), tried, len(tried) + search.solved)
+        search.climb("work", near, least=least)
+    met = [*tried, *search.met]
+    return Optimum(best, undominated(met, front + 2), tried, len(tried) + search.solved)
 
 
 _OBJECTIVES: tuple[Objective, Objective] = ("stroke", "work")
 
 
-def undominated(designs: Sequence[Design]) -> list[Design]:
-    """Those that no other beats in stroke and work, by rising stroke."""
+def undominated(designs: Sequence[Design], most: int) -> list[Design]:
+    """Those that no other beats in stroke and work, by rising stroke; of more than ``most``, some at like distances."""
     front: list[Design] = []
     for design in sorted(designs, key=lambda d: (-d.counted("stroke"), -d.counted("work"))):
         if not front or design.counted("work") > front[-1].counted("work"):
             front.append(design)
-    return front[::-1]
+    front.reverse()
+    if len(front) <= most:
+        return front
+    strokes = np.array([design.counted("stroke") for design in front])
+    wanted = np.linspace(strokes[0], strokes[-1], most)
+    return [front[k] for k in np.unique([int(np.abs(strokes - one).argmin()) for one in wanted])]
 
 
 class _Search:
-    """Local searches that remember the design they evaluated last."""
+    """Local searches; ``met`` are the designs that they evaluated."""
 
     def __init__(self, task: Task) -> None:
         self.task, self.solved = task, 0
-        self._at: tuple[float, ...] = ()
-        self._design: Design | None = None
+        self.met: list[Design] = []
+        self._known: dict[tuple[float, ...], Design] = {}
 
     def design(self, shares: Array) -> Design:
         """The design with its slopes."""
         key = tuple(float(share) for share in np.clip(shares, 0.0, 1.0))
-        if self._design is None or key != self._at:
-            self._at = key
+        if key not in self._known:
             if self.task.uncertain is None:
-                self._design = evaluate(self.task, [np.array(key)], slopes=True)[0]
+                self._known[key] = evaluate(self.task, [np.array(key)], slopes=True)[0]
                 self.solved += 1
             else:
-                self._design = self._by_differences(np.array(key))
-        return self._design
+                self._known[key] = self._by_differences(np.array(key))
+            self.met.append(self._known[key])
+        return self._known[key]
 
     def _by_differences(self, at: Array) -> Design:
         """Robust objectives hold gradients themselves: theirs are differences, all solved together."""
@@ -257,7 +264,7 @@ class _Search:
         }
         return replace(here, slope=slope)
 
-    def climb(self, objective: Objective, begin: Array, least: float | None = None) -> Design:
+    def climb(self, objective: Objective, begin: Array, least: float | None = None) -> None:
         """SLSQP from ``begin``, with a stroke of at least ``least``."""
         import scipy.optimize
 
@@ -273,7 +280,7 @@ class _Search:
                     "jac": lambda x: self.design(x).slope["stroke"] / scale["stroke"],
                 }
             ]
-        found = minimize(
+        minimize(
             lambda x: -self.design(x).counted(objective) / scale[objective],
             np.clip(begin, 0.0, 1.0),
             jac=lambda x: -self.design(x).slope[objective] / scale[objective],
@@ -282,4 +289,3 @@ class _Search:
             constraints=constraints,
             options={"maxiter": STEPS, "ftol": CLOSE},
         )
-        return self.design(found.x)
