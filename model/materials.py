@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 # scipy.constants.epsilon_0 (CODATA 2022), written out because importing SciPy is slow; a test compares the two.
 EPSILON_0 = 8.8541878188e-12
@@ -62,7 +63,7 @@ class Material:
             if limit is not None and not least < limit < math.inf:
                 raise ValueError(f"{label}: {name} = {limit!r}; it must be above {least:g} and finite, or None")
 
-    @property
+    @cached_property
     def shear_modulus(self) -> float:
         """Small-strain shear modulus ``G = 1/2 sum mu_n alpha_n`` (Pa)."""
         return 0.5 * math.fsum(m * a for m, a in zip(self.mu, self.alpha, strict=True))

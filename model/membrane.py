@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from model import ritz, single, tension_field, trace
 from model.ladder import FLAT, Answer, Start, climb, first_modes
 from model.law import Array, Evaluations, Film, stack, stress
+from model.materials import EPSILON_0
 from model.profile import Profile, dense, profile
 from model.ritz import LONGEST, Grid, Problem, State
 from model.single_parts import Film as OneFilm
@@ -208,8 +209,9 @@ class _Inputs:
         index = np.flatnonzero(np.isfinite(self.h) & np.isfinite(self.voltage))
         charged = self.voltage[index] != 0.0
         groups = [index] if charged.all() or not charged.any() else [index[~charged], index[charged]]
+        of_film = np.log([s.ring_radius / s.disk_radius for s in self.specimens])
         for group in groups:
-            spans = np.array([math.log(s.ring_radius / s.disk_radius) for s in self.specimens])[self.which[group]]
+            spans = of_film[self.which[group]]
             if len(self.specimens) > 1:
                 order = np.argsort(spans, kind="stable")
                 group, spans = group[order], spans[order]
@@ -221,8 +223,10 @@ class _Inputs:
 
 
 def _padded(materials: Sequence[tuple[float, ...]], fill: float) -> Array:
-    terms = max(len(values) for values in materials)
-    return np.array([values + (fill,) * (terms - len(values)) for values in materials]).T
+    terms = max(map(len, materials))
+    if any(len(values) < terms for values in materials):
+        materials = [values + (fill,) * (terms - len(values)) for values in materials]
+    return np.array(materials).T
 
 
 def solve_many(
@@ -436,8 +440,9 @@ class _Block:
         self.index = index
         self.h, self.voltage = inputs.h[index], inputs.voltage[index]
         used, pick = np.unique(inputs.which[index], return_inverse=True)
-        films = [inputs.specimens[i] for i in used]
-        self.terms = np.array([len(s.material.mu) for s in films], dtype=np.intp)[pick]
+        films = [inputs.specimens[i] for i in used.tolist()]
+        materials = [s.material for s in films]
+        self.terms = np.array([len(m.mu) for m in materials], dtype=np.intp)[pick]
         numbers = np.array(
             [
                 (
@@ -445,25 +450,24 @@ class _Block:
                     s.ring_radius,
                     s.thickness,
                     s.prestretch,
-                    s.material.shear_modulus,
-                    s.material.eps_r,
-                    s.material.permittivity,
-                    s.material.breakdown_field or math.inf,
-                    s.material.max_stretch or math.inf,
+                    m.shear_modulus,
+                    m.eps_r,
+                    m.breakdown_field or math.inf,
+                    m.max_stretch or math.inf,
                 )
-                for s in films
+                for s, m in zip(films, materials, strict=True)
             ]
-        ).reshape(len(films), 9)[pick]
-        self.a, self.b, self.t, self.lp, self.shear, self.eps_r, eps, self.strength, self.elongation = numbers.T
-        mu = _padded([s.material.mu for s in films], 0.0)
-        alpha = _padded([s.material.alpha for s in films], 1.0)
+        ).reshape(len(films), 8)[pick]
+        self.a, self.b, self.t, self.lp, self.shear, self.eps_r, self.strength, self.elongation = numbers.T
+        mu = _padded([m.mu for m in materials], 0.0)
+        alpha = _padded([m.alpha for m in materials], 1.0)
         if len(films) > 1:
             mu, alpha = mu[:, pick], alpha[:, pick]
         charged = bool(np.any(self.voltage))
         film = Film(
             mu=mu / (self.shear if len(films) > 1 else self.shear[:1]),
             alpha=alpha,
-            field=eps * (self.voltage / self.t) ** 2 / self.shear if charged else None,
+            field=EPSILON_0 * self.eps_r * (self.voltage / self.t) ** 2 / self.shear if charged else None,
             count=count,
         )
         # The flat film is the limit of a vanishing height: solve there, then give zero force.

@@ -163,11 +163,11 @@ def _peak(tables: Tables, column: Floats) -> tuple[float, float]:
     low, xi, high = (-math.cos(min(max(top + k, 0), FINE - 1) * math.pi / (FINE - 1)) for k in (-1, 0, 1))
     c = (tables.to_legendre @ column).tolist()
     for _ in range(POLISH):
-        _, slope, curve = series(c, xi)
+        value, slope, curve = series(c, xi)
         if curve >= 0.0:
-            break
+            return value, 0.5 * (1.0 + xi)
         step = slope / curve
+        if abs(step) < 1e-3:  # the parabola there errs by its cube
+            return value - 0.5 * slope * step, 0.5 * (1.0 + xi - step)
         xi = min(max(xi - step, low), high)
-        if abs(step) < 1e-6:
-            break
     return series(c, xi)[0], 0.5 * (1.0 + xi)

@@ -306,7 +306,8 @@ def _batch_points(states: Sequence[Case], truth: Reference, batch: int) -> list[
     """The same states in one call, over and over until they make a batch; time is per state."""
     n = len(states)
     several = [states[i % n] for i in range(max(batch, n))]
-    specimens = [case.specimen for case in several]
+    # Every state has a film and a material of its own, as in a fit or a design.
+    specimens = [replace(case.specimen, material=replace(case.specimen.material)) for case in several]
     h = np.array([case.h for case in several])
     voltage = np.array([case.voltage for case in several])
     points = []
