@@ -90,6 +90,7 @@ def test_a_bistable_bias_has_three_equilibria_and_loses_two_of_them_as_the_volta
     assert len(equilibria(actuator, 2000.0).found) == 1
 
 
+@pytest.mark.slow
 def test_two_equilibria_between_two_samples_are_found() -> None:
     """Just before the fold at which the bistable actuator snaps, two equilibria lie closer than the samples."""
     actuator = Actuator(LOOSE, BISTABLE)
