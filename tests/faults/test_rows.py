@@ -22,6 +22,7 @@ ROWS: dict[int, Row] = {
         [
             "faults/test_processes.py::test_engine_killed",
             "faults/test_processes.py::test_engine_killed_at_200_random_instants",
+            "faults/test_serial_supply.py::test_killed",
         ],
     ),
     2: (
@@ -51,6 +52,7 @@ ROWS: dict[int, Row] = {
         [
             "faults/test_processes.py::test_guard_killed",
             "faults/test_processes.py::test_guard_that_hangs_is_ended_and_replaced_by_the_engine",
+            "faults/test_serial_supply.py::test_killed",
         ],
     ),
     5: (
