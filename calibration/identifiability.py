@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -33,11 +34,14 @@ def expected_uncertainties(curves: Sequence[Curve], material: Material) -> dict[
     return expected(curves, material).quantities
 
 
-def advice(curves: Sequence[Curve], material: Material, quantities: Mapping[str, Quantity]) -> list[str]:
+def advice(
+    curves: Sequence[Curve], material: Material, quantities: Mapping[str, Quantity], reach: float = math.inf
+) -> list[str]:
     """Which of a few further measurements would shrink the largest uncertainty of an Ogden term, and to what.
 
     Every candidate is a set of curves added to the present ones, at 0 V and with the present noise, judged by the
-    Fisher information at ``material``. Empty when all terms are at least weakly identified.
+    Fisher information at ``material``. ``reach`` (m) is as far as the rig may go. Empty when all terms are at least
+    weakly identified.
     """
     raw = {name: q.relative for name, q in quantities.items() if name.startswith(("mu", "alpha"))}
     if max(raw.values()) <= WEAKLY_IDENTIFIED:
@@ -47,14 +51,17 @@ def advice(curves: Sequence[Curve], material: Material, quantities: Mapping[str,
     least = min(abs(curve.nominal_voltage) for curve in curves)
     plain = [curve for curve in curves if abs(curve.nominal_voltage) == least]
     farthest = max(float(np.nanmax(curve.h)) for curve in plain)
-    candidates = {
-        f"going on to {1e3 * FARTHER * farthest:.3g} mm at 0 V": [
-            _added(c, FARTHER, c.specimen.prestretch) for c in plain
+    factor = min(FARTHER, reach / farthest)
+    candidates, words = {}, []
+    if factor > 1.02:
+        limit = " (the limit)" if factor < FARTHER else ""
+        candidates[f"going on to {1e3 * factor * farthest:.3g} mm{limit} at 0 V"] = [
+            _added(c, factor, c.specimen.prestretch) for c in plain
         ]
-    }
+    else:
+        words.append(f"a larger displacement would help, but {1e3 * reach:.3g} mm is the limit")
     if max(curve.specimen.prestretch for curve in plain) > 1.05:
         candidates["a film mounted without pre-stretch, at 0 V"] = [_added(curve, 1.0, 1.0) for curve in plain]
-    words = []
     for what, added in candidates.items():
         try:
             then = expected_uncertainties([*curves, *added], material)[worst].relative

@@ -60,6 +60,7 @@ def identify(
     fixed: Mapping[str, float] | None = None,
     wrinkling: Wrinkling = "plain",
     near: Sequence[Material] = (),
+    reach: float = math.inf,
     provenance: Mapping[str, Any] | None = None,
 ) -> Identification:
     """Fit an Ogden film to force-displacement curves.
@@ -84,6 +85,8 @@ def identify(
         counted either way.
     near : sequence of Material
         Further starting points, of at most as many terms.
+    reach : float
+        Largest displacement (m) that the rig may go to; no advice goes beyond.
     provenance : mapping, optional
         Whatever identifies the data (hashes of logs, names of files), as plain JSON values; kept in the result.
 
@@ -135,7 +138,7 @@ def identify(
         "settings": {"terms": terms, "starts": starts, "seed": seed, "fixed": held, "wrinkling": wrinkling},
         "software": {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")},
     }
-    return _assemble(best, fits, held, notes, record, profiles=profiles)
+    return _assemble(best, fits, held, notes, record, profiles=profiles, reach=reach)
 
 
 def _too_coarse(problem: Problem, x: Array) -> bool:
@@ -377,6 +380,7 @@ def _assemble(
     provenance: dict[str, Any],
     *,
     profiles: bool,
+    reach: float,
 ) -> Identification:
     """The result of ``fit``; ``fits`` are the minima from all starting points, best first."""
     problem, x = fit.problem, fit.x
@@ -392,7 +396,7 @@ def _assemble(
     bias = None if guilty is None else guilty.amplitude * guilty.shape
     stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals, suspect=bias)
     quantities = stated.quantities
-    if profiles:
+    if profiles or fit.at_bound[: problem.terms].any():  # where a term has vanished, curvature says nothing of it
         aims = targets(problem, stated.stretch, held)
         found = intervals(problem, x, problem.bounds(x), fit.varied, quantities, aims, misfit)
         quantities.update({name: widened(quantities[name], ends, misfit) for name, ends in found.items()})
@@ -421,6 +425,7 @@ def _assemble(
         samples_per_independent=problem.correlation_time,
         parameters=stated.parameters,
         correlation=stated.correlation,
+        covariance=stated.covariance,
         condition=stated.condition,
         aicc=fitness + 2.0 * free + crowding,
         bic=fitness + free * math.log(effective),
@@ -428,7 +433,7 @@ def _assemble(
         starts=len(fits),
         starts_agreeing=sum(other.cost - fits[0].cost < SAME_MINIMUM for other in fits),
         warnings=[],
-        advice=[] if held else advice(problem.curves, problem.film(x), stated.quantities),
+        advice=[] if held else advice(problem.curves, problem.film(x), stated.quantities, reach),
         provenance=provenance,
     )
     if misfit > WRONG_MODEL:
@@ -476,6 +481,7 @@ def _curve_results(problem: Problem, x: Array) -> list[CurveResult]:
                 samples=curve.h.size,
                 used=int(selection.used.sum()),
                 excluded=dict(selection.excluded),
+                wrinkled=selection.wrinkled,
                 rms_residual=rms,
                 rms_expected=expected,
                 lag1_autocorrelation=lag1,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -156,6 +156,14 @@ class Propagation:
         relative = total / abs(value) if value else math.inf
         return Quantity(value, total, unit, budget, verdict(relative, at_bound), at_bound)
 
+    def covariances(self, gradients: Array) -> Array:
+        """Covariance matrix of functions of x with these gradients, by all parts that propagate linearly."""
+        total: Array = gradients @ self.covariance.matrix @ gradients.T * self.misfit
+        for effect in (*self.effects.values(), *(() if self.bias is None else (self.bias,))):
+            change = gradients @ effect
+            total = total + np.outer(change, change)
+        return total
+
     def budget(self, gradient: Array) -> dict[str, float]:
         """Independent parts of the standard uncertainty of a function of x with this gradient."""
         rows = gradient @ self.covariance.response
@@ -192,6 +200,7 @@ class Statement:
     along: list[Quantity]  # the same, with their budgets
     parameters: list[str]
     correlation: list[list[float]]
+    covariance: list[list[float]]
     condition: float
 
 
@@ -258,6 +267,10 @@ def state(
             lambda m: m.eps_r, slopes["eps_r"], "1", at_bound=bool(at_bound[2 * n])
         )
 
+    if vanished.any():  # what is left is another model: its terms are not those that were asked for
+        lost = [name for name in quantities if name.startswith(("mu", "alpha"))]
+        quantities |= {name: replace(quantities[name], verdict=verdict(math.inf, True)) for name in lost}
+
     nuisance = {}
     for k, one in enumerate(problem.nuisances, start=problem.film_parameters):
         slope = np.zeros(x.size)
@@ -281,6 +294,7 @@ def state(
         along=along,
         parameters=list(slopes),
         correlation=_correlation(np.array(list(slopes.values())), propagation.covariance.matrix),
+        covariance=propagation.covariances(np.array(list(slopes.values()))).tolist(),
         condition=_condition(problem, x, free),
     )
 

@@ -17,6 +17,7 @@ from calibration.curve import Curve
 from calibration.identify import secant_modulus
 from calibration.reduction import select
 from calibration.result import CONVENTION, IDENTIFIED, WEAKLY_IDENTIFIED, Identification, Quantity
+from calibration.rounding import percent, rounded
 from model.materials import Material
 
 
@@ -158,7 +159,7 @@ def _row(name: str, quantity: Quantity, known: Mapping[str, float]) -> _Row:
         budget={part: percent(size / abs(quantity.value)) for part, size in quantity.budget.items()}
         if quantity.value
         else {},
-        truth=rounded(known[name] * factor, quantity.uncertainty * factor)[0] if known_here else "",
+        truth=f"{known[name] * factor:.6g} {unit}".strip() if known_here else "",
         deviation=f"{(quantity.value - known[name]) / quantity.uncertainty:+.2f}"
         if known_here and math.isfinite(quantity.uncertainty)
         else "",
@@ -181,24 +182,6 @@ def _truth(identification: Identification, truth: Material | None) -> dict[str, 
         for n, (alpha, mu) in enumerate(sorted(zip(truth.alpha, truth.mu, strict=True)), start=1):
             known |= {f"mu{n}": mu, f"alpha{n}": alpha}
     return known
-
-
-def rounded(value: float, uncertainty: float) -> tuple[str, str]:
-    """Value and uncertainty as text, to two significant digits of the uncertainty."""
-    if not math.isfinite(uncertainty) or uncertainty <= 0.0:
-        return f"{value:.4g}", "not determined" if uncertainty > 0.0 else "0"
-    digits = max(0, 1 - math.floor(math.log10(float(f"{uncertainty:.1e}"))))
-    return f"{value:.{digits}f}", f"{uncertainty:.{digits}f}"
-
-
-def percent(fraction: float) -> str:
-    """A relative uncertainty as text, to two significant digits."""
-    if not math.isfinite(fraction) or fraction > 10.0:
-        return "> 1000 %"
-    if fraction < 5e-6:
-        return "0 %"
-    value = float(f"{100 * fraction:.1e}")
-    return f"{value:.{max(0, 1 - math.floor(math.log10(value)))}f} %"
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,6 +75,7 @@ class CurveResult:
     samples: int
     used: int
     excluded: dict[str, int]
+    wrinkled: int
     rms_residual: float
     rms_expected: float
     lag1_autocorrelation: float
@@ -120,8 +122,9 @@ class Identification:
         Scatter about the nearest smooth curves over the stated standard deviation.
     samples_per_independent : float
         1 for independent samples; the fit counts n samples as n over this.
-    parameters, correlation : list of str, list of list of float
-        Correlations of the raw parameters.
+    parameters, correlation, covariance : list of str, list of list of float, list of list of float
+        Correlations of the raw parameters by noise and zeros; their covariances, in SI units, by all that propagates
+        linearly.
     condition : float
         Condition number of the least-squares problem in relative changes of the raw parameters.
     warnings, advice : list of str
@@ -148,6 +151,7 @@ class Identification:
     samples_per_independent: float
     parameters: list[str]
     correlation: list[list[float]]
+    covariance: list[list[float]]
     condition: float
     aicc: float
     bic: float
@@ -183,6 +187,7 @@ class Identification:
         """Plain numbers, strings, lists and dictionaries; a number that is not finite becomes None."""
         return {
             "format": "dea-rig identification 1",
+            "model": "incompressible Ogden film, axisymmetric membrane, ideal dielectric",
             "convention": CONVENTION,
             "terms": self.terms,
             "quantities": {name: quantity_dict(q) for name, q in self.quantities.items()},
@@ -227,6 +232,7 @@ class Identification:
             "samples_excluded": self.excluded,
             "parameters": self.parameters,
             "correlation": self.correlation,
+            "covariance": self.covariance,
             "condition_number": _finite(self.condition),
             "aicc": self.aicc,
             "bic": self.bic,
@@ -245,6 +251,7 @@ class Identification:
                     "samples": c.samples,
                     "samples_used": c.used,
                     "excluded": c.excluded,
+                    "wrinkled": c.wrinkled,
                     "rms_residual_N": _finite(c.rms_residual),
                     "rms_expected_N": _finite(c.rms_expected),
                     "lag1_autocorrelation": _finite(c.lag1_autocorrelation),
@@ -259,9 +266,14 @@ class Identification:
             "provenance": self.provenance,
         }
 
-    def to_json(self) -> str:
-        """`to_dict` as JSON text."""
-        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
+    def to_json(self, comparison: Sequence[Identification] = ()) -> str:
+        """`to_dict` as JSON text, with what a ``comparison`` of several numbers of terms says beside it."""
+        values = self.to_dict()
+        if comparison:
+            values["comparison"] = [
+                {name: one.to_dict()[name] for name in ("terms", "aicc", "bic", "held_out")} for one in comparison
+            ]
+        return json.dumps(values, indent=2, allow_nan=False) + "\n"
 
 
 def quantity_dict(quantity: Quantity) -> dict[str, Any]:

@@ -251,17 +251,34 @@ def sim(scene: Path) -> None:
 @click.option("-o", "--out", type=FILE, help="Result as JSON.")
 @click.option("--report", type=FILE, help="Result as one self-contained HTML page.")
 @click.option("--terms", type=click.IntRange(1, 3), default=2, show_default=True, help="Ogden terms.")
+@click.option("--compare", "comparing", is_flag=True, help="Judge 1, 2 and 3 terms: AICc, BIC, held-out curves.")
 @click.option("--profiles", is_flag=True, help="95 % intervals from profile likelihood too; takes longer.")
-def fit(logs: tuple[Path, ...], out: Path | None, report: Path | None, terms: int, profiles: bool) -> None:
+@click.option(
+    "--wrinkled",
+    type=click.Choice(["left-out", "tension-field"]),
+    default="left-out",
+    show_default=True,
+    help="Samples at which the film is wrinkled: leave out, or describe by the tension field. Counted either way.",
+)
+def fit(
+    logs: tuple[Path, ...],
+    out: Path | None,
+    report: Path | None,
+    terms: int,
+    comparing: bool,
+    profiles: bool,
+    wrinkled: str,
+) -> None:
     """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties."""
     from rig.identification import identify_logs, write_results
     from rig.outputs import check_new
-    from rig.tables import identification_table, show
+    from rig.tables import comparison_table, identification_table, show
 
     check_new(out, report)
-    found = identify_logs(list(logs), terms=terms, profiles=profiles)
+    found = identify_logs(list(logs), terms=terms, comparing=comparing, profiles=profiles, wrinkled=wrinkled)
     write_results(found, out, report)
-    show(identification_table(found.identification), *(f"note: {note}" for note in found.notes))
+    tables = [comparison_table(found.comparison)] if comparing else []
+    show(identification_table(found.identification), *tables, *(f"note: {note}" for note in found.notes))
     for path in (out, report):
         if path is not None:
             click.echo(f"written: {path}")

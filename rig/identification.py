@@ -5,15 +5,16 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calibration.certificate import Certificate, CertificateError
 from calibration.curve import Curve, CurveError
 from calibration.homogeneous import TestsError, TestsFit, fit_tests, load_test
-from calibration.identify import IdentificationError, identify
+from calibration.identify import IdentificationError, compare, identify
 from calibration.result import Identification
 from model.materials import Material
 from rig.errors import ConfigError, DataError
@@ -40,12 +41,21 @@ class Found:
     provenance: dict[str, object]
     truth: Material | None
     notes: list[str]
+    comparison: list[Identification] = field(default_factory=list)
 
 
-def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = False) -> Found:
+def identify_logs(
+    paths: Sequence[Path],
+    *,
+    terms: int = 2,
+    comparing: bool = False,
+    profiles: bool = False,
+    wrinkled: str = "left-out",
+) -> Found:
     """Identify the film from all recorded curves of all logs at once.
 
-    ``profiles`` adds 95 % intervals from profile likelihood, which take a few seconds more.
+    ``comparing`` judges 1, 2 and 3 Ogden terms beside each other, ``profiles`` adds 95 % intervals from profile
+    likelihood; each takes a few seconds more. ``wrinkled`` is "left-out" or "tension-field".
 
     Raises
     ------
@@ -71,10 +81,18 @@ def identify_logs(paths: Sequence[Path], *, terms: int = 2, profiles: bool = Fal
             curves += [_with_drift(curve, certificates) for curve in inside]
         if not curves:
             raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
-        identification = identify(curves, terms=terms, profiles=profiles, provenance=provenance)
+        options: dict[str, Any] = {
+            "profiles": profiles,
+            "provenance": provenance,
+            "wrinkling": "tension_field" if wrinkled == "tension-field" else "plain",
+            "reach": min(scene.limits.displacement_mm for scene in scenes) * 1e-3,
+        }
+        comparison = compare(curves, **options) if comparing else []
+        same = [one for one in comparison if one.terms == terms]
+        identification = same[0] if same else identify(curves, terms=terms, **options)
     except (CurveError, IdentificationError, CertificateError) as error:
         raise DataError(f"{error}.") from None
-    return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs))
+    return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs), comparison)
 
 
 def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certificate]) -> Curve:
@@ -142,7 +160,7 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
     """
     try:
         if fit is not None:
-            write_text(fit, found.identification.to_json())
+            write_text(fit, found.identification.to_json(found.comparison))
         if report is not None:
             from calibration.report import write_report
 
@@ -153,6 +171,7 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
                 scene_texts={str(run.log.path): run.scene for run in found.runs},
                 provenance=found.provenance,
                 truth=found.truth,
+                comparison=found.comparison,
             )
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None

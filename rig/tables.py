@@ -9,12 +9,12 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from rich.console import RenderableType
 
     from calibration.homogeneous import TestsFit
-    from calibration.result import Identification
+    from calibration.result import Identification, Quantity
     from drivers.discovery import Found as FoundDevice
     from rig.calibrate.analysis import Calibration
     from rig.experiment import Experiment
@@ -161,43 +161,60 @@ def _minutes(seconds: float) -> str:
 
 def identification_table(found: Identification) -> Group:
     """The identified quantities with their standard uncertainties and verdicts, and what speaks against them."""
-    table = Table(title=f"Identified with {found.terms} Ogden terms, {found.used} samples, {found.excluded} left out")
-    table.add_column("quantity")
-    table.add_column("value", justify="right")
-    table.add_column("standard uncertainty", justify="right")
-    table.add_column("relative", justify="right")
-    table.add_column("verdict")
-    for name, quantity in found.quantities.items():
-        table.add_row(
-            _NAMES.get(name, name),
-            _with_unit(quantity.value, quantity.unit, 5),
-            _with_unit(quantity.uncertainty, quantity.unit, 2),
-            f"{100 * quantity.relative:.2g} %",
-            quantity.verdict + (" (at its bound)" if quantity.at_bound else ""),
-        )
+    table = _quantities(
+        f"Identified with {found.terms} Ogden terms, {found.used} samples, {found.excluded} left out", found.quantities
+    )
     lines: list[RenderableType] = [
         table,
         f"reduced chi-square {found.reduced_chi_square:.3f} ({found.freedom} degrees of freedom); stiffness is the "
-        f"secant shear modulus at stretches {found.stretch[0]:.2f} (meridional) and {found.stretch[1]:.2f} (hoop).",
+        f"secant shear modulus at stretches {found.stretch[0]:.2f} (meridional; largest "
+        f"{found.stiffness_curve.meridional_stretch[-1]:.2f}) and {found.stretch[1]:.2f} (hoop).",
     ]
     lines += [f"note: {warning}" for warning in found.warnings]
     lines += [f"advice: {advice}" for advice in found.advice]
     return Group(*lines)
 
 
-def tests_table(found: TestsFit) -> Group:
-    """Ogden terms from homogeneous tests, and how much of each test they explain."""
-    table = Table(title=f"Identified from homogeneous tests with {len(found.mu)} Ogden terms")
-    for heading in ("quantity", "value", "standard uncertainty", "relative", "verdict"):
-        table.add_column(heading, justify="left" if heading in ("quantity", "verdict") else "right")
-    for name, quantity in found.quantities.items():
+def comparison_table(found: Sequence[Identification]) -> Table:
+    """The same data with several numbers of Ogden terms."""
+    table = Table(title="Ogden terms: smaller criteria are better, differences below 2 mean nothing")
+    for heading in ("terms", "AICc", "BIC", "held out / noise", "not identifiable"):
+        table.add_column(heading, justify="left" if heading == "not identifiable" else "right", overflow="fold")
+    least = [min(getattr(one, name) for one in found) for name in ("aicc", "bic")]
+    for one in found:
+        lost = [name for name, quantity in one.quantities.items() if quantity.verdict.startswith("not")]
+        predicted = ", ".join(f"{part.ratio:.2f}" for part in one.held_out)
+        criteria = (f"{value - low:+.1f}" for value, low in zip((one.aicc, one.bic), least, strict=True))
+        table.add_row(str(one.terms), *criteria, predicted or "-", ", ".join(lost) or "-")
+    return table
+
+
+def _quantities(title: str, quantities: Mapping[str, Quantity]) -> Table:
+    """Values to the digits of their uncertainties; no number is cut on a narrow terminal."""
+    from calibration.rounding import percent, rounded
+
+    table = Table(title=title)
+    table.add_column("quantity", overflow="fold")
+    for heading in ("value", "+-"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    table.add_column("relative", justify="right", no_wrap=True)
+    table.add_column("verdict", overflow="fold")
+    for name, quantity in quantities.items():
+        factor, unit = _SHOWN.get(quantity.unit, (1.0, quantity.unit))
         table.add_row(
             _NAMES.get(name, name),
-            _with_unit(quantity.value, quantity.unit, 5),
-            _with_unit(quantity.uncertainty, quantity.unit, 2),
-            f"{100 * quantity.relative:.2g} %",
-            quantity.verdict,
+            *rounded(quantity.value * factor, quantity.uncertainty * factor),
+            unit,
+            percent(quantity.relative),
+            quantity.verdict + (" (at its bound)" if quantity.at_bound else ""),
         )
+    return table
+
+
+def tests_table(found: TestsFit) -> Group:
+    """Ogden terms from homogeneous tests, and how much of each test they explain."""
+    table = _quantities(f"Identified from homogeneous tests with {len(found.mu)} Ogden terms", found.quantities)
     explained = Table(title="Share of variance explained, R^2")
     explained.add_column("test")
     explained.add_column("fitted", justify="right")
@@ -212,6 +229,7 @@ def tests_table(found: TestsFit) -> Group:
 def truth_table(found: Found) -> RenderableType:
     """The simulation's hidden truth beside what was identified, the difference in stated standard uncertainties."""
     from calibration.identify import secant_modulus
+    from calibration.rounding import rounded
 
     truth, identification = found.truth, found.identification
     if truth is None:
@@ -228,17 +246,15 @@ def truth_table(found: Found) -> RenderableType:
         for n, (mu, alpha) in enumerate(sorted(zip(truth.mu, truth.alpha, strict=True), key=lambda term: term[1])):
             known |= {f"mu{n + 1}": mu, f"alpha{n + 1}": alpha}
     table = Table(title="Truth against identified")
-    for heading in ("quantity", "truth", "identified", "uncertainty", "difference in uncertainties"):
-        table.add_column(heading, justify="left" if heading == "quantity" else "right")
+    for heading in ("quantity", "truth", "identified", "unit", "+-", "off / +-"):
+        table.add_column(heading, justify="left" if heading in ("quantity", "unit") else "right", no_wrap=True)
     for name, quantity in identification.quantities.items():
         if name in known:
-            table.add_row(
-                _NAMES.get(name, name),
-                f"{known[name]:.5g}",
-                _with_unit(quantity.value, quantity.unit, 5),
-                f"{100 * quantity.relative:.2g} %",
-                f"{(quantity.value - known[name]) / quantity.uncertainty:+.2f}",
-            )
+            factor, unit = _SHOWN.get(quantity.unit, (1.0, quantity.unit))
+            value, uncertainty = rounded(quantity.value * factor, quantity.uncertainty * factor)
+            off = (quantity.value - known[name]) / quantity.uncertainty
+            row = (f"{known[name] * factor:.6g}", value, unit, uncertainty, f"{off:+.2f}")
+            table.add_row(_NAMES.get(name, name), *row)
     return table
 
 
@@ -256,13 +272,10 @@ def devices_table(found: Sequence[FoundDevice]) -> list[RenderableType]:
     return [table, *(["For the scene:", *lines] if lines else [])]
 
 
-def _with_unit(value: float, unit: str, digits: int) -> str:
-    return f"{value:.{digits}g}" + (f" {unit}" if unit != "1" else "")
-
-
+_SHOWN = {"Pa": (1e-3, "kPa"), "1": (1.0, "")}  # factor and unit in tables
 _NAMES = {
-    "eps_r": "permittivity eps_r",
-    "stiffness": "stiffness, best determined",
-    "stiffness_end": "stiffness, largest stretch",
-    "G": "shear modulus G",
+    "eps_r": "permittivity",
+    "stiffness": "stiffness (best)",
+    "stiffness_end": "stiffness (end)",
+    "G": "shear modulus",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -193,13 +194,18 @@ def extreme_states(report: Extremes, path: Path) -> None:
     _finish(figure, path)
 
 
+def _decades(values: list[float]) -> tuple[float, float]:
+    """Whole decades around the values: a logarithmic axis whose labels do not crowd."""
+    return 10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values) * 1.01))
+
+
 def fits(report: Fits, path: Path) -> None:
     """Error of the film against compute time, compute time against samples, error against the time of the rig."""
-    figure, panels = _figure(13.0, 7.6, 2, 3)
+    figure, panels = _figure(15.0, 7.4, 2, 4)
     look = {"reduced, analytic Jacobian": (BLACK, "o"), "reduced, finite differences": (VERMILLION, "s")}
     titles = {"G": "Shear modulus G", "alpha": "Exponent alpha", "eps_r": "Permittivity eps_r"}
     swept = [point for point in report.points if point.samples == report.swept]
-    for axes, (name, title) in zip(panels[0], titles.items(), strict=True):
+    for axes, (name, title) in zip(panels[0][:3], titles.items(), strict=True):
         for method, (colour, marker) in look.items():
             mine = [point for point in swept if point.method == method]
             x, y = [1e3 * point.seconds for point in mine], [max(point.error[name], 1e-12) for point in mine]
@@ -208,11 +214,12 @@ def fits(report: Fits, path: Path) -> None:
                 if point.tolerance in (1e-3, 1e-5, 1e-7):
                     label = f"{point.tolerance:.0e}"
                     axes.annotate(label, (at, error), xytext=(5, 4), textcoords="offset points", fontsize=8)
-        axes.set(xscale="log", yscale="log", title=title, xlabel="time of a fit / ms")
+        axes.set(xscale="log", yscale="log", title=title, xlabel="time of a fit / ms", ylim=(1e-9, 1e-3))
+        axes.set_xlim(*_decades([1e3 * point.seconds for point in swept]))
         _tidy(axes)
     panels[0][0].set_ylabel("error against finer numerics\n(marks: solver tolerance)")
     panels[0][0].legend(frameon=False)
-    left = panels[1][0]
+    left = panels[0][3]
     for method, colour, marker in (
         ("reduced, analytic Jacobian", BLACK, "o"),
         ("every sample, analytic", SKY, "^"),
@@ -220,10 +227,11 @@ def fits(report: Fits, path: Path) -> None:
         mine = [point for point in report.points if point.method == method and point.samples != report.swept]
         label = {BLACK: "a few states a curve", SKY: "a state for every sample"}[colour]
         left.plot([p.samples for p in mine], [p.states for p in mine], color=colour, marker=marker, label=label)
+    left.set(ylim=_decades([point.states for point in report.points]))
     left.set(xscale="log", yscale="log", title="Cost", xlabel="samples a curve", ylabel="membrane states of a fit")
     left.legend(frameon=False)
     _tidy(left)
-    for axes, name in zip(panels[1][1:], ("alpha", "eps_r"), strict=True):
+    for axes, name in zip(panels[1][:3], titles, strict=True):
         for protocol, colour, marker in (("uniform sweep", GREY, "s"), ("planned", BLUE, "o")):
             rows = [one for one in report.rig if one.protocol == protocol]
             x = [one.duration / 60 for one in rows]
@@ -231,12 +239,14 @@ def fits(report: Fits, path: Path) -> None:
             stated = [100 * one.stated[name] for one in rows]
             axes.plot(x, stated, color=colour, linestyle="--", label=f"{protocol}, as stated")
         axes.set(xscale="log", yscale="log", title=f"{titles[name]}, on the rig", xlabel="time of the rig / min")
+        axes.set_ylim(*_decades([v for one in report.rig for v in (100 * one.error[name], 100 * one.stated[name])]))
         ticks = sorted({round(one.duration / 60) for one in report.rig})
         axes.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
         axes.set_xticks([], minor=True)
         _tidy(axes)
-    panels[1][1].set_ylabel("error / %, noise and zeros")
-    panels[1][2].legend(frameon=False)
+    panels[1][0].set_ylabel("error / %, noise and zeros")
+    panels[1][3].axis("off")
+    panels[1][3].legend(*panels[1][0].get_legend_handles_labels(), loc="center left", frameon=False)
     runs = report.rig[0].runs if report.rig else 0
     figure.suptitle(
         f"Error of the identified film against time: on the computer, and on the rig ({runs} experiments each)"

@@ -11,8 +11,9 @@ import pytest
 
 from calibration.curve import Curve
 from calibration.identify import identify
-from calibration.report import percent, rounded, write_report
+from calibration.report import write_report
 from calibration.result import Identification
+from calibration.rounding import percent, rounded
 from model.materials import NAMED
 
 Experiment = Callable[..., list[Curve]]

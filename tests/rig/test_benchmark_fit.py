@@ -12,6 +12,8 @@ from rich.console import Console
 
 from rig.benchmark import fit
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def report() -> fit.Report:
