@@ -56,7 +56,11 @@ def _exit_code(error: Exception) -> int | None:
     return 1 if isinstance(error, OSError) else None  # the disk or terminal that was to be written to
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+EXIT_CODES = """Exit codes: 0 done; 1 nothing useful came of it; 2 a file or option cannot be used, nothing was touched;
+3 a limit; 4 a fault of the rig; 130 stopped by the operator."""
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]}, epilog=EXIT_CODES)
 @click.version_option(package_name="dea-rig")
 def main() -> None:
     """Characterise conical dielectric elastomer actuators on a bench, real or simulated.
@@ -355,6 +359,8 @@ def view(log: Path, save: Path | None, screenshot: Path | None) -> None:
 def solve(cases: Path) -> None:
     """Solve the films in CASES.json (- reads standard input) and print the answers as JSON.
 
+    Exit code 1 when not a single case describes a film.
+
     CASES is a list of objects in SI units with id, a, b, thickness, prestretch, h, voltage, wrinkling ("plain" or
     "tension_field"), material {mu, alpha, eps_r} and optionally tolerance.
     """
@@ -366,6 +372,8 @@ def solve(cases: Path) -> None:
     except CaseError as error:
         raise ConfigError(f"{cases}: {error}.") from None
     click.echo(json.dumps(answers, indent=2))
+    if answers and all(answer["status"] == "invalid" for answer in answers):
+        click.get_current_context().exit(1)
 
 
 main.add_command(benchmark)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from rig.errors import ConfigError
 from rig.table import Table
@@ -71,11 +72,11 @@ def validate(raw: dict[str, Any], table: type[T], kind: str, source: str) -> T:
 def _explain(error: ValidationError, table: type[Table], kind: str, source: str) -> str:
     """One line a problem: key = value, then what is wrong or allowed."""
     lines = [f"{source}: this {kind} file cannot be used."]
-    problems = error.errors(include_url=False, include_context=False)
+    problems = error.errors(include_url=False)
     for problem in problems[:12]:
         location = problem["loc"]
         key = _key(location)
-        message = problem["msg"].removeprefix("Value error, ")
+        message = _in_words(problem)
         if problem["type"] == "extra_forbidden":
             allowed = _allowed_keys(table, location[:-1])
             near = difflib.get_close_matches(str(location[-1]), allowed, n=1, cutoff=0.5)
@@ -90,6 +91,23 @@ def _explain(error: ValidationError, table: type[Table], kind: str, source: str)
     if len(problems) > 12:
         lines.append(f"  ... and {len(problems) - 12} more.")
     return "\n".join(lines)
+
+
+def _in_words(problem: ErrorDetails) -> str:
+    """What is wrong, in words of the file rather than of the program that reads it."""
+    context = problem.get("ctx", {})
+    match problem["type"]:
+        case "union_tag_invalid":
+            return f"{context['discriminator']} is '{context['tag']}'; allowed are {context['expected_tags']}"
+        case "union_tag_not_found":
+            return f"the key {context['discriminator']} is missing, which says what kind of table this is"
+        case "model_type" | "dict_type" | "model_attributes_type":
+            return "a table of keys is needed here"
+        case "list_type":
+            return "a list in square brackets is needed here"
+        case "string_type":
+            return "a text in quotes is needed here"
+    return problem["msg"].removeprefix("Value error, ")
 
 
 def _short(value: object) -> str:

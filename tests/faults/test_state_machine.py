@@ -114,6 +114,7 @@ class Rig(RuleBasedStateMachine):
             since = self.told[len(self.told) - self.told[::-1].index("arm") :]
             assert not {"switch_off", "emergency_off"} & set(since), "a voltage after the latch, without arming anew"
         self.told.append(command)
+        self.told_at = self.clock.now()
 
     @property
     def output(self) -> float:
@@ -293,7 +294,7 @@ class Rig(RuleBasedStateMachine):
         now = self.clock.now()
         if self.safe_since is None or not self.guard.commanded or now <= self.bad_until:
             return
-        latched = now - max(self.safe_since, self.bad_until)
+        latched = now - max(self.safe_since, self.told_at, self.bad_until)
         if latched > HIGHEST / RAMP + 1.0:
             assert self.output < SAFE_VOLTAGE, f"latched for {latched:.2f} s ({self.guard.cause})"
         if self.told[-1] == "emergency_off" and latched > TOLD_S + FALL_S:
