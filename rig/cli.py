@@ -193,12 +193,12 @@ def calibrate(
 @click.argument("log", type=FILE)
 @click.option("-o", "--out", type=FILE, help="The table as CSV.")
 @click.option("--picture", type=FILE, help="PNG or SVG.")
-@click.option("--material", help="Of the film for the expectation, by name; default: the scene's.")
-def stroke(log: Path, out: Path | None, picture: Path | None, material: str | None) -> None:
+@click.option("--fit", type=FILE, help="Result of `dea-rig fit`: expect what that film does, not the scene's.")
+def stroke(log: Path, out: Path | None, picture: Path | None, fit: Path | None) -> None:
     """Stroke and work against a virtual spring, mass or second cone in LOG: measured beside expected."""
     from rig.commands.stroke import tell_strokes
 
-    tell_strokes(log, out, picture, material)
+    tell_strokes(log, out, picture, fit)
 
 
 @main.command()
@@ -324,13 +324,16 @@ def plan_command(scene: Path, time: str, fit: Path | None, terms: int, out: Path
 
     Compares what the protocol is expected to tell with the uniform sweep in the same time. Touches no hardware.
     """
+    from rig.fit_file import read_fit
     from rig.identification import write_text
     from rig.outputs import check_new
-    from rig.proposal import film_of, parse_time, propose_protocol
+    from rig.proposal import parse_time, propose_protocol
+    from rig.scene import load_scene
     from rig.tables import proposal_table, show
 
     check_new(out)
-    found = propose_protocol(scene, parse_time(time), None if fit is None else film_of(fit), terms=terms)
+    film = None if fit is None else read_fit(fit, load_scene(scene)[0].specimen.specimen().material).material
+    found = propose_protocol(scene, parse_time(time), film, terms=terms)
     if out is not None:
         write_text(out, found.text)
     show(proposal_table(found))

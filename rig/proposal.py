@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,6 @@ from rig.plan import check_plan, plan
 from rig.protocol import Protocol
 from rig.safety.limits import Limits
 from rig.scene import Scene, load_scene
-from rig.toml_file import read_text
 
 Array = NDArray[np.float64]
 
@@ -87,7 +85,7 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
     scene, _ = load_scene(scene_path)
     certificates = certificates_of(scene, scene_path.parent)
     specimen = scene.specimen.specimen()
-    specimen = specimen if film is None else specimen.with_material(_limited(film, specimen.material))
+    specimen = specimen if film is None else specimen.with_material(film)
     if terms == 1 and len(specimen.material.mu) > 1:
         lp = specimen.prestretch
         specimen = specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
@@ -272,29 +270,6 @@ def recorded(
             )
         )
     return curves
-
-
-def film_of(path: Path) -> Material:
-    """The film that `dea-rig fit` wrote to the JSON file ``path``.
-
-    Raises
-    ------
-    ConfigError
-        When it is not such a file.
-    """
-    try:
-        found = json.loads(read_text(path, "fit"))
-        quantities, terms = found["quantities"], int(found["terms"])
-        mu, alpha = ([float(quantities[f"{name}{n + 1}"]["value"]) for n in range(terms)] for name in ("mu", "alpha"))
-        eps_r = float(quantities["eps_r"]["value"]) if "eps_r" in quantities else 1.0
-        return Material(name=f"identified ({path.name})", mu=tuple(mu), alpha=tuple(alpha), eps_r=eps_r)
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise ConfigError(f"{path}: not a result of `dea-rig fit`: {error!r}.") from None
-
-
-def _limited(film: Material, believed: Material) -> Material:
-    """The film with the strength and the elongation that are believed of it, which no fit tells."""
-    return replace(film, breakdown_field=believed.breakdown_field, max_stretch=believed.max_stretch)
 
 
 def _design(protocol: Protocol, scene: Scene, stated: Statement, stretch: float) -> Design:

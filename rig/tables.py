@@ -73,12 +73,17 @@ def stroke_table(strokes: Sequence[Stroke]) -> Table:
             f"{one.step} {one.kind}",
             f"{one.voltage:.0f}",
             f"{one.stroke * 1e6:.1f} +- {one.stroke_uncertainty * 1e6:.1f}",
-            f"{one.expected_stroke * 1e6:.1f}",
+            _with_error(one.expected_stroke * 1e6, one.expected_stroke_uncertainty * 1e6, 1),
             f"{one.deviation * 100:+.1f} %",
             f"{one.work * 1e3:.4f} +- {one.work_uncertainty * 1e3:.4f}",
-            f"{one.expected_work * 1e3:.4f}",
+            _with_error(one.expected_work * 1e3, one.expected_work_uncertainty * 1e3, 4),
         )
     return table
+
+
+def _with_error(value: float, error: float, digits: int) -> str:
+    """The value, and its uncertainty where one is known."""
+    return f"{value:.{digits}f}" + (f" +- {error:.{digits}f}" if error == error else "")
 
 
 def calibration_table(found: Calibration) -> list[RenderableType]:

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import click
 
-from model.materials import NAMED
-from rig.errors import ConfigError
 from rig.follow.analysis import Stroke, strokes
 from rig.identification import write_text
 from rig.outputs import check_new
@@ -23,22 +21,22 @@ UNITS = {
     "work": "J",
     "work_uncertainty": "J",
     "expected_stroke": "m",
+    "expected_stroke_uncertainty": "m",
     "expected_work": "J",
+    "expected_work_uncertainty": "J",
 }
 
 
-def tell_strokes(log: Path, out: Path | None, picture: Path | None, material: str | None) -> None:
+def tell_strokes(log: Path, out: Path | None, picture: Path | None, fit: Path | None) -> None:
     """Show the table, and write it and its picture where asked for.
 
     Raises
     ------
     RigError
-        When an output exists, the material is not known, or the log holds no strokes.
+        When an output exists, the fit cannot be used, or the log holds no strokes.
     """
     check_new(out, picture)
-    if material is not None and material not in NAMED:
-        raise ConfigError(f"--material {material}: not known; known are {', '.join(sorted(NAMED))}.")
-    found = strokes(log, None if material is None else NAMED[material])
+    found = strokes(log, fit)
     show(stroke_table(found))
     if out is not None:
         write_text(out, _csv(found))

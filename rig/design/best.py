@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.table import Table
 
 from model.design import Point, Treatment
-from model.materials import Material
 from model.optimise import Design, Optimum, Task, Uncertain
 from model.stroke import Limit
 from rig.design import pictures
 from rig.design.study import VARIABLES, OptimiseStudy
 from rig.errors import ConfigError
-from rig.toml_file import read_text
+from rig.fit_file import read_fit
 
 
 def task_of(study: OptimiseStudy) -> Task:
@@ -31,8 +27,9 @@ def task_of(study: OptimiseStudy) -> Task:
     film = study.film.film(study.disk_radius_mm, study.prestretch)
     uncertain = None
     if study.fit is not None:
-        material, uncertain = read_fit(Path(study.fit), film.material, study.coverage)
-        film = film.with_material(material)
+        fitted = read_fit(Path(study.fit), film.material)
+        uncertain = Uncertain(fitted.names, fitted.covariance, study.coverage)
+        film = film.with_material(fitted.material)
     recipe = study.bias.recipes([study.case])[study.case]
     criteria = study.limits.criteria(film.material)
     point = Point(study.case, film, recipe, Treatment(study.treatment), criteria)
@@ -40,36 +37,6 @@ def task_of(study: OptimiseStudy) -> Task:
         return Task(point, study.vary.si(), uncertain)
     except ValueError as error:
         raise ConfigError(f"vary: {error}.") from None
-
-
-def read_fit(path: Path, known: Material, coverage: float) -> tuple[Material, Uncertain]:
-    """The film that was identified, with strength and largest stretch of the ``known`` one, and its covariance.
-
-    Raises
-    ------
-    ConfigError
-        When the file is no result of `dea-rig fit -o`.
-    """
-    try:
-        fit = json.loads(read_text(path, "fit"))
-        names = tuple(fit["parameters"])
-        values = {name: float(fit["quantities"][name]["value"]) for name in names}
-        deviation = np.array([float(fit["quantities"][name]["standard_uncertainty"]) for name in names])
-        correlation = np.array(fit["correlation"], dtype=float)
-        terms = range(1, int(fit["terms"]) + 1)
-        material = replace(
-            known,
-            name=f"{path.name}",
-            mu=tuple(values[f"mu{k}"] for k in terms),
-            alpha=tuple(values[f"alpha{k}"] for k in terms),
-            eps_r=values.get("eps_r", known.eps_r),
-        )
-        covariance = correlation * np.outer(deviation, deviation)
-        if covariance.shape != (len(names), len(names)) or not np.isfinite(covariance).all():
-            raise ValueError("its covariance is not complete")
-    except (KeyError, TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: not a fit that an optimum can be made robust with: {error}.") from None
-    return material, Uncertain(names, covariance, coverage)
 
 
 def _row(kind: str, design: Design) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from model.actuator import Actuator, balance
 from model.bias import Bias
 from model.materials import Material
 from rig.errors import DataError
+from rig.fit_file import FittedFilm, read_fit
 from rig.follow.plan import rest_from
 from rig.follow.steps import Follow
 from rig.log.dataset import Phase, Run, load_run
@@ -33,6 +34,7 @@ from rig.toml_file import parse_table
 Floats = NDArray[np.float64]
 
 BATCH_S = 0.5  # noise is judged by means over this long: neighbouring samples may share an error
+NUDGE = 1e-4  # by this part a parameter is changed to see what depends on it
 NODES = 32  # of the quadrature of the expected work
 
 
@@ -51,9 +53,9 @@ class Rest:
 
 @dataclass(frozen=True)
 class Stroke:
-    """One release under voltage: measured and expected stroke (m) and work (J), standard uncertainties of the measured.
+    """One release under voltage: measured and expected stroke (m) and work (J), with standard uncertainties.
 
-    ``voltage`` is the mean measured one (V).
+    ``voltage`` is the mean measured one (V). Those of the expected ones are of the film's fit; NaN without a fit.
     """
 
     step: int
@@ -66,7 +68,9 @@ class Stroke:
     work: float
     work_uncertainty: float
     expected_stroke: float
+    expected_stroke_uncertainty: float
     expected_work: float
+    expected_work_uncertainty: float
 
     @property
     def deviation(self) -> float:
@@ -74,13 +78,13 @@ class Stroke:
         return self.stroke / self.expected_stroke - 1.0
 
 
-def strokes(path: Path, material: Material | None = None) -> list[Stroke]:
+def strokes(path: Path, fit: Path | None = None) -> list[Stroke]:
     """Every release under voltage in the log.
 
     Parameters
     ----------
-    material : Material, optional
-        Of the film for the expectation; the scene's when left out.
+    fit : Path, optional
+        Result of `dea-rig fit -o`: the film of the expectation, and how well it is known. The scene's when left out.
 
     Raises
     ------
@@ -91,9 +95,9 @@ def strokes(path: Path, material: Material | None = None) -> list[Stroke]:
     scene = parse_table(run.scene, Scene, "scene", f"{path} (scene inside)")
     steps = parse_table(run.protocol, Protocol, "protocol", f"{path} (protocol inside)").step
     film = scene.specimen.specimen()
-    film = film if material is None else film.with_material(material)
+    fitted = None if fit is None else read_fit(fit, film.material)
+    film = film if fitted is None else film.with_material(fitted.material)
     certificates = run.certificates
-    top = scene.limits.displacement_mm * 1e-3
     found: list[Stroke] = []
     for number, step in enumerate(steps, start=1):
         if not isinstance(step, Follow):
@@ -102,7 +106,7 @@ def strokes(path: Path, material: Material | None = None) -> list[Stroke]:
         rests = [_rest(run, phase, end, actuator) for phase, end in _phases(run, "rest") if phase.step == number]
         for before, there, after in zip(rests, rests[1:], rests[2:], strict=False):
             if before.voltage == 0.0 == after.voltage and there.voltage > 0.0:
-                found.append(_stroke(run, number, step, actuator, (before, there, after), certificates, top))
+                found.append(_stroke(run, number, step, actuator, (before, there, after), certificates, fitted))
     if not found:
         raise DataError(f"{path}: holds no follow step with a rest under voltage and one at 0 V on either side.")
     return found
@@ -146,7 +150,7 @@ def _stroke(
     actuator: Actuator,
     rests: tuple[Rest, Rest, Rest],
     certificates: Mapping[str, Certificate],
-    top: float,
+    fitted: FittedFilm | None,
 ) -> Stroke:
     before, there, after = rests
     start = 0.5 * (before.h + after.h)
@@ -170,8 +174,7 @@ def _stroke(
     work_uncertainty = math.hypot(
         work_noise, gains.get("force", 0.0) * mean_force * stroke, gains.get("displacement", 0.0) * work
     )
-    rest = rest_from(actuator, 0.0, 0.0, top)
-    expected = rest_from(actuator, rest, there.voltage, top) if rest is not None else None
+    expected, uncertain = _expectation(actuator, there.voltage, fitted, step)
     return Stroke(
         step=number,
         kind=step.bias.kind,
@@ -182,10 +185,10 @@ def _stroke(
         stroke_uncertainty=uncertainty,
         work=work,
         work_uncertainty=work_uncertainty,
-        expected_stroke=math.nan if rest is None or expected is None else expected - rest,
-        expected_work=math.nan
-        if rest is None or expected is None
-        else _expected(actuator, rest, expected, there.voltage),
+        expected_stroke=expected[0],
+        expected_stroke_uncertainty=uncertain[0],
+        expected_work=expected[1],
+        expected_work_uncertainty=uncertain[1],
     )
 
 
@@ -208,9 +211,53 @@ def _work(run: Run, bias: Bias, begin: float, end: float, h0: float, h1: float) 
     return float(weights @ excess), math.sqrt(scatter * float(weights @ weights))
 
 
-def _expected(actuator: Actuator, h0: float, h1: float, voltage: float) -> float:
-    """Integral of ``B - F`` (J) by the model, Gauss-Legendre."""
+def _expectation(
+    actuator: Actuator, voltage: float, fitted: FittedFilm | None, step: Follow
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Stroke and work by the model, and their standard uncertainties by the fit's covariance (first order)."""
+    expected = _expected(actuator, voltage)
+    if fitted is None:
+        return expected, (math.nan, math.nan)
+    slopes = []
+    for name in fitted.names:
+        sides = []
+        for sign in (1.0, -1.0):
+            film = actuator.film.with_material(_nudged(fitted.material, name, 1.0 + sign * NUDGE))
+            sides.append(_expected(Actuator(film, step.bias.bias(film)), voltage))
+        width = 2 * NUDGE * _value(fitted.material, name)
+        slopes.append([(up - down) / width for up, down in zip(*sides, strict=True)])
+    by = np.array(slopes)
+    variance = np.einsum("pi,pq,qi->i", by, fitted.covariance, by)
+    stroke, work = np.sqrt(np.maximum(variance, 0.0)).tolist()
+    return expected, (stroke, work)
+
+
+def _value(material: Material, name: str) -> float:
+    """The parameter ``name`` ("mu1", "alpha1", "eps_r")."""
+    if name == "eps_r":
+        return material.eps_r
+    key = name.rstrip("0123456789")
+    return float(getattr(material, key)[int(name.removeprefix(key)) - 1])
+
+
+def _nudged(material: Material, name: str, factor: float) -> Material:
+    """The material with the parameter ``name`` multiplied by ``factor``."""
+    if name == "eps_r":
+        return replace(material, eps_r=material.eps_r * factor)
+    key = name.rstrip("0123456789")
+    values = list(getattr(material, key))
+    values[int(name.removeprefix(key)) - 1] *= factor
+    return replace(material, mu=tuple(values)) if key == "mu" else replace(material, alpha=tuple(values))
+
+
+def _expected(actuator: Actuator, voltage: float) -> tuple[float, float]:
+    """Stroke (m) and work (J, Gauss-Legendre) by the model; NaN where it knows no rest."""
+    top = actuator.span[1]
+    h0 = rest_from(actuator, 0.0, 0.0, top)
+    h1 = None if h0 is None else rest_from(actuator, h0, voltage, top)
+    if h0 is None or h1 is None:
+        return math.nan, math.nan
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     h = 0.5 * (h0 + h1) + 0.5 * (h1 - h0) * nodes
     states = balance([actuator], h[None], np.full((1, NODES), voltage))
-    return float(-states.excess[0] @ weights) * 0.5 * (h1 - h0)
+    return h1 - h0, float(-states.excess[0] @ weights) * 0.5 * (h1 - h0)

@@ -1,5 +1,8 @@
 """The stage in place of a bias: stroke and work that it measures, on the simulated bench."""
 
+import json
+import math
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -9,6 +12,7 @@ from model.bias import Bistable, Mass, Spring
 from rig.cli import main
 from rig.errors import FaultError, LimitError
 from rig.experiment import prepare, run
+from rig.fit_file import read_fit
 from rig.follow.analysis import strokes
 from rig.follow.plan import rest_from
 from rig.log.dataset import load_run
@@ -67,6 +71,36 @@ def test_table_and_picture(short, tmp_path):
     values = dict(zip(heading.split(","), row.split(","), strict=True))
     assert float(values["stroke_m"]) == pytest.approx(strokes(short)[0].stroke, rel=1e-6)
     assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_a_fit_does_not_know_is_told(short, tmp_path):
+    """First order against drawn films: the expectation's uncertainty is that of the fit."""
+    relative = {"mu1": 0.004, "alpha1": 0.003, "mu2": 0.002, "alpha2": 0.002, "eps_r": 0.01}
+    true = {"mu1": 5e3, "alpha1": 2.5, "mu2": 35e3, "alpha2": 5.6, "eps_r": 1.7}
+    fit = {
+        "terms": 2,
+        "parameters": list(true),
+        "correlation": np.eye(5).tolist(),
+        "quantities": {
+            name: {"value": value, "standard_uncertainty": relative[name] * value} for name, value in true.items()
+        },
+    }
+    path = tmp_path / "fit.json"
+    path.write_text(json.dumps(fit))
+    (found,) = strokes(short, path)
+    rng = np.random.default_rng(3)
+    drawn = []
+    for _ in range(60):
+        values = {name: value * (1 + relative[name] * rng.standard_normal()) for name, value in true.items()}
+        for name, value in values.items():
+            fit["quantities"][name]["value"] = value
+        path.write_text(json.dumps(fit))
+        film = read_fit(path, load_scene_of_fixture()[0].specimen.specimen().material).material
+        actuator = Actuator(load_scene_of_fixture()[0].specimen.specimen().with_material(film), Mass(0.25))
+        rest = rest_from(actuator, 0.0, 0.0, 20e-3)
+        drawn.append(rest_from(actuator, rest, found.voltage, 20e-3) - rest)
+    assert found.expected_stroke_uncertainty == pytest.approx(np.std(drawn, ddof=1), rel=0.3)
+    assert found.expected_stroke == pytest.approx(np.mean(drawn), abs=3 * np.std(drawn) / math.sqrt(60))
 
 
 def test_a_rest_is_the_next_stable_balance_that_way():
