@@ -128,11 +128,11 @@ def experiment(protocol: Protocol, seed: int) -> list[Curve]:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_in_half_the_time_it_does_tell_as_much(half: proposal.Proposal, whole: proposal.Proposal) -> None:
-    """Scatter about the truth over 24 simulated experiments each; two scatters of 24 differ by chance by 20 %."""
+    """Scatter about the truth over 48 simulated experiments each; two such scatters differ by chance by 15 %."""
     scatter, stated = {}, {}
     for label, protocol in (("planned", half.planned.protocol), ("sweep", whole.sweep.protocol)):
         errors, uncertainties = [], []
-        for seed in range(24):
+        for seed in range(48):
             found = identify(experiment(protocol, seed), terms=1, starts=1)
             stiffness = found.quantities["stiffness"]
             known = secant_modulus(ONE_TERM, *found.stretch)
@@ -144,8 +144,8 @@ def test_in_half_the_time_it_does_tell_as_much(half: proposal.Proposal, whole: p
             )
         scatter[label] = np.sqrt(np.mean(np.square(errors), axis=0))
         stated[label] = np.median(uncertainties, axis=0)
-    assert (scatter["planned"] < 1.45 * scatter["sweep"]).all(), scatter
-    assert (stated["planned"] < 1.1 * stated["sweep"]).all(), stated
+    assert (scatter["planned"] < 1.35 * scatter["sweep"]).all(), scatter
+    assert (stated["planned"] <= stated["sweep"]).all(), stated
     assert (scatter["planned"] < 1.5 * stated["planned"]).all(), (scatter, stated)
 
 
