@@ -71,9 +71,10 @@ def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
     stays_off(stand, at)
     assert "without taking leave. The high voltage is off, measured" in live.said
     # The guard's own end of the log outlives the engine: the command, and the measured proof of what came of it.
+    part = live.log.with_name(live.log.name + ".part")
+    stand.wait(lambda: read_log(part).ended, "the log's end")  # its writer is the last one to go
     assert commands(live)[-1] == "emergency_off"
-    log = read_log(live.log.with_name(live.log.name + ".part"))
-    last = log.columns("/hv/sample")["voltage_V"][-2:]
+    last = read_log(part).columns("/hv/sample")["voltage_V"][-2:]
     assert (abs(last) < 60.0).all()
 
 

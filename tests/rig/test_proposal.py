@@ -113,7 +113,7 @@ def test_the_command_writes_the_protocol_and_never_over_another(tmp_path: Path) 
     assert CliRunner().invoke(main, arguments).exit_code == 2
     refused = CliRunner().invoke(main, ["plan", scene, "--time", "3min", "--fit", scene])
     assert refused.exit_code == 2
-    assert "not a result of `dea-rig fit`" in refused.output
+    assert "not a usable result of `dea-rig fit -o`" in refused.output
 
 
 # --- simulated experiments
