@@ -92,6 +92,7 @@ class Rig(RuleBasedStateMachine):
         self.supply = IsegEDCP("hv", MemoryFrameLink("hv", wire, self.clock))
         film = FilmLimits(SPECIMEN, LIMITS)
         self.told: list[str] = []
+        self.armed_at = self.told_at = -math.inf
         self.guard = Guard(self.supply, LIMITS, film, RAMP, self.tell, {"force": FRESH_S})
         self.arming = Arming("a test")
         self.beats = 0
@@ -115,6 +116,7 @@ class Rig(RuleBasedStateMachine):
             assert not {"switch_off", "emergency_off"} & set(since), "a voltage after the latch, without arming anew"
         self.told.append(command)
         self.told_at = self.clock.now()
+        self.armed_at = self.told_at if command == "arm" else self.armed_at
 
     @property
     def output(self) -> float:
@@ -164,8 +166,8 @@ class Rig(RuleBasedStateMachine):
 
     @rule()
     def arm(self) -> None:
-        if self.ended or self.guard.state is not GuardState.SAFE:
-            return
+        if self.ended or not (self.beating and self.fresh) or self.guard.state is not GuardState.SAFE:
+            return  # an engine that hangs, or has no data, asks for nothing
         before = self.bench.world.output.changes
         try:
             self.arming.check(1.0)
@@ -177,7 +179,7 @@ class Rig(RuleBasedStateMachine):
 
     @rule(volts=st.sampled_from([0.0, 300.0, 1000.0, 1500.0, 1800.0, 1801.0, -1.0, math.nan, math.inf]))
     def voltage(self, volts: float) -> None:
-        if self.ended:
+        if self.ended or not self.beating:
             return
         state, setpoint = self.guard.state, self.guard.setpoint
         try:
@@ -191,7 +193,7 @@ class Rig(RuleBasedStateMachine):
 
     @rule(h_mm=st.sampled_from([0.0, 4.0, 8.0, 11.0, 12.0, 12.5, 13.0, 14.0]))
     def move(self, h_mm: float) -> None:
-        if self.ended:
+        if self.ended or not self.beating:
             return
         try:
             self.guard.check_move(self.h, h_mm * 1e-3)
@@ -226,13 +228,15 @@ class Rig(RuleBasedStateMachine):
         # A driver asks again after its time-outs, and gives up after the third; then the loop tells it again.
         self.bad_until = max(self.bad_until, self.clock.now() + seconds + 1.5)
 
-    @rule()
-    def hang(self) -> None:
+    @rule(n=st.sampled_from([0, 4, 14]))
+    def hang(self, n: int) -> None:
         self.beating = not self.beating
+        self.tick(n)
 
-    @rule()
-    def lose_a_sensor(self) -> None:
+    @rule(n=st.sampled_from([0, 4, 14]))
+    def lose_a_sensor(self, n: int) -> None:
         self.fresh = not self.fresh
+        self.tick(n)
 
     @rule(how=st.sampled_from(["damaged", "repeated", "skipped"]))
     def bad_heartbeat(self, how: str) -> None:
@@ -303,11 +307,19 @@ class Rig(RuleBasedStateMachine):
     @invariant()
     def without_signs_of_life_the_output_is_off(self) -> None:
         now = self.clock.now()
-        silent = now - max(self.last_beat, self.bad_until)
+        silent = now - max(self.last_beat, self.bad_until, self.armed_at)
         if self.guard.commanded and not self.beating and silent > DEADLINE_S + 2 * TICK_S + TOLD_S + FALL_S:
-            ramp = self.told and self.told[-1] in ("switch_off", "take_down")  # an orderly end before that
+            # Only what was being ramped down in good order before may take its time, and what was cut this moment.
+            ramp = self.told[-1] == "switch_off" and self.told_at <= self.last_beat + DEADLINE_S
+            cut = self.told[-1] == "emergency_off" and now - self.told_at <= TOLD_S + FALL_S
             assert self.guard.state is GuardState.SAFE
-            assert self.output < SAFE_VOLTAGE or ramp
+            assert self.output < SAFE_VOLTAGE or ramp or cut or self.told[-1] == "take_down"
+
+    @invariant()
+    def without_fresh_data_the_guard_is_safe(self) -> None:
+        now = self.clock.now()
+        if now - self.fresh_at > FRESH_S + 2 * TICK_S and now - self.armed_at > 2 * TICK_S + DEADLINE_S and self.beats:
+            assert self.guard.state is GuardState.SAFE
 
 
 @cache
