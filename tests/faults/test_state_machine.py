@@ -135,7 +135,7 @@ class Rig(RuleBasedStateMachine):
                 beat = Heartbeat(self.beats, now, self.h, {"force": self.fresh_at})
                 self.last_beat = now
                 self.guard.heartbeat(beat.encode(), now)
-            self.guard.turn(now)
+            self.turn_of_the_guard(now)
         except (FaultError, LimitError, DeviceError) as error:
             self.clock.sleep_until(end)
             self.fault(error)
@@ -143,6 +143,16 @@ class Rig(RuleBasedStateMachine):
             self.safe_since = None
         elif self.safe_since is None:
             self.safe_since = end
+
+    def turn_of_the_guard(self, now: float) -> None:
+        """What the guard does by itself; an engine that hangs does not hear of it and adds nothing."""
+        try:
+            self.guard.turn(now)
+        except (FaultError, LimitError):
+            self.arming.withdraw()
+            self.ended = True
+            if self.beating:
+                raise
 
     def fault(self, error: Exception) -> None:
         """As the teardown does: off at once, and again while the supply does not answer."""
