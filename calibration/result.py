@@ -6,11 +6,14 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calibration.held_out import HeldOut
 from calibration.misfit import Suspect
 from model.materials import Material
+
+if TYPE_CHECKING:
+    from calibration.posterior import Posterior
 
 CONVENTION = "W = sum mu_n/alpha_n (l1^alpha_n + l2^alpha_n + (l1 l2)^-alpha_n - 3), G = 1/2 sum mu_n alpha_n"
 
@@ -133,6 +136,8 @@ class Identification:
         Information criteria; smaller is better, differences below 2 mean nothing.
     held_out : list of HeldOut
         Predictions of curves from the others, where they were asked for.
+    posterior : Posterior or None
+        What Markov chains say of the same data, where they were asked for.
     """
 
     material: Material
@@ -162,6 +167,7 @@ class Identification:
     advice: list[str]
     provenance: dict[str, Any] = field(default_factory=dict)
     held_out: list[HeldOut] = field(default_factory=list)
+    posterior: Posterior | None = None
 
     @property
     def terms(self) -> int:
@@ -261,6 +267,7 @@ class Identification:
                 }
                 for c in self.curves
             ],
+            **({"posterior": self.posterior.to_dict()} if self.posterior is not None else {}),
             "warnings": self.warnings,
             "advice": self.advice,
             "provenance": self.provenance,

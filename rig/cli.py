@@ -257,6 +257,7 @@ def sim(scene: Path) -> None:
 @click.option("--terms", type=click.IntRange(1, 3), default=2, show_default=True, help="Ogden terms.")
 @click.option("--compare", "comparing", is_flag=True, help="Judge 1, 2 and 3 terms: AICc, BIC, held-out curves.")
 @click.option("--profiles", is_flag=True, help="95 % intervals from profile likelihood too; takes longer.")
+@click.option("--posterior", is_flag=True, help="Markov chains too (extra `posterior`); takes a minute or more.")
 @click.option(
     "--wrinkled",
     type=click.Choice(["left-out", "tension-field"]),
@@ -271,17 +272,21 @@ def fit(
     terms: int,
     comparing: bool,
     profiles: bool,
+    posterior: bool,
     wrinkled: str,
 ) -> None:
     """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties."""
     from rig.identification import identify_logs, write_results
     from rig.outputs import check_new
-    from rig.tables import comparison_table, identification_table, show
+    from rig.tables import comparison_table, identification_table, posterior_table, show
 
     check_new(out, report)
-    found = identify_logs(list(logs), terms=terms, comparing=comparing, profiles=profiles, wrinkled=wrinkled)
+    found = identify_logs(
+        list(logs), terms=terms, comparing=comparing, profiles=profiles, wrinkled=wrinkled, posterior=posterior
+    )
     write_results(found, out, report)
     tables = [comparison_table(found.comparison)] if comparing else []
+    tables += [posterior_table(found.identification)] if posterior else []
     show(identification_table(found.identification), *tables, *(f"note: {note}" for note in found.notes))
     for path in (out, report):
         if path is not None:

@@ -35,8 +35,7 @@ def read_fit(path: Path, believed: Material) -> FittedFilm:
         fit = json.loads(read_text(path, "fit"))
         names = tuple(str(name) for name in fit["parameters"])
         values = {name: float(fit["quantities"][name]["value"]) for name in names}
-        deviation = np.array([float(fit["quantities"][name]["standard_uncertainty"]) for name in names])
-        covariance = np.array(fit["correlation"], dtype=float) * np.outer(deviation, deviation)
+        covariance = np.array(fit["covariance"], dtype=float)
         if covariance.shape != (len(names), len(names)) or not np.isfinite(covariance).all():
             raise ValueError("its covariance is not complete")
         terms = range(1, int(fit["terms"]) + 1)

@@ -51,11 +51,13 @@ def identify_logs(
     comparing: bool = False,
     profiles: bool = False,
     wrinkled: str = "left-out",
+    posterior: bool = False,
 ) -> Found:
     """Identify the film from all recorded curves of all logs at once.
 
     ``comparing`` judges 1, 2 and 3 Ogden terms beside each other, ``profiles`` adds 95 % intervals from profile
-    likelihood; each takes a few seconds more. ``wrinkled`` is "left-out" or "tension-field".
+    likelihood, ``posterior`` Markov chains; each takes a few seconds more. ``wrinkled`` is "left-out" or
+    "tension-field".
 
     Raises
     ------
@@ -90,6 +92,10 @@ def identify_logs(
         comparison = compare(curves, **options) if comparing else []
         same = [one for one in comparison if one.terms == terms]
         identification = same[0] if same else identify(curves, terms=terms, **options)
+        if posterior:
+            from calibration.posterior import posterior as sample
+
+            identification = replace(identification, posterior=sample(curves, identification))
     except (CurveError, IdentificationError, CertificateError) as error:
         raise DataError(f"{error}.") from None
     return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs), comparison)

@@ -86,6 +86,25 @@ def _with_error(value: float, error: float, digits: int) -> str:
     return f"{value:.{digits}f}" + (f" +- {error:.{digits}f}" if error == error else "")
 
 
+def posterior_table(found: Identification) -> Table:
+    """What the Markov chains say, beside the fit."""
+    chains = found.posterior
+    assert chains is not None
+    ended = "" if chains.converged else " TOO SHORT for its autocorrelation: do not rely on it."
+    table = Table(
+        title="Posterior by Markov chains; gains and dimensions held",
+        caption=f"{chains.walkers} walkers, {chains.steps} steps, {chains.acceptance:.0%} accepted, "
+        f"autocorrelation {chains.autocorrelation:.0f} steps.{ended}",
+    )
+    table.add_column("quantity")
+    for heading in ("fit", "mean", "standard deviation", "95 % from", "to"):
+        table.add_column(heading, justify="right")
+    for name, one in chains.quantities.items():
+        numbers = (found.quantities[name].value, one.mean, one.deviation, one.low, one.high)
+        table.add_row(f"{name} / {one.unit}" if one.unit else name, *(f"{value:.5g}" for value in numbers))
+    return table
+
+
 def calibration_table(found: Calibration) -> list[RenderableType]:
     """What a calibration found, with its budget."""
     tables: list[RenderableType] = []

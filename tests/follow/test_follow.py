@@ -80,7 +80,7 @@ def test_what_a_fit_does_not_know_is_told(short, tmp_path):
     fit = {
         "terms": 2,
         "parameters": list(true),
-        "correlation": np.eye(5).tolist(),
+        "covariance": np.diag([(relative[name] * value) ** 2 for name, value in true.items()]).tolist(),
         "quantities": {
             name: {"value": value, "standard_uncertainty": relative[name] * value} for name, value in true.items()
         },

@@ -311,7 +311,11 @@ def test_an_optimum_takes_film_and_covariance_from_a_fit(tmp_path: Path) -> None
     fit = {
         "terms": 1,
         "parameters": ["mu1", "alpha1", "eps_r"],
-        "correlation": [[1.0, -0.9, 0.1], [-0.9, 1.0, 0.0], [0.1, 0.0, 1.0]],
+        "covariance": [
+            [900.0**2, -0.9 * 900 * 0.05, 0.1 * 900 * 0.04],
+            [-0.9 * 900 * 0.05, 0.05**2, 0.0],
+            [3.6, 0.0, 0.04**2],
+        ],
         "quantities": {
             "mu1": {"value": 4.2e4, "standard_uncertainty": 900.0},
             "alpha1": {"value": 5.4, "standard_uncertainty": 0.05},
@@ -334,9 +338,9 @@ def test_an_optimum_takes_film_and_covariance_from_a_fit(tmp_path: Path) -> None
     assert both == pytest.approx(900.0 * math.sqrt(0.2))
     with pytest.raises(ConfigError, match="preload is no quantity of a mass"):
         task_of(study.model_copy(update={"vary": type(study.vary)(preload_N=[0.1, 1.0])}))
-    del fit["correlation"]
+    del fit["covariance"]
     (tmp_path / "fit.json").write_text(json.dumps(fit))
-    with pytest.raises(ConfigError, match="correlation"):
+    with pytest.raises(ConfigError, match="covariance"):
         task_of(study)
 
 

@@ -102,7 +102,7 @@ def test_the_command_writes_the_protocol_and_never_over_another(tmp_path: Path) 
     fit = tmp_path / "fit.json"
     found = {"mu1": 2e4, "alpha1": 5.0}
     quantities = {name: {"value": value, "standard_uncertainty": value / 100} for name, value in found.items()}
-    result = {"terms": 1, "parameters": list(found), "quantities": quantities, "correlation": [[1, 0], [0, 1]]}
+    result = {"terms": 1, "parameters": list(found), "quantities": quantities, "covariance": [[1, 0], [0, 1]]}
     fit.write_text(json.dumps(result))
     scene = str(FIXTURES / "scenes" / "no-hv.toml")
     arguments = ["plan", scene, "--time", "3min", "--fit", str(fit), "-o", str(out)]

@@ -1,0 +1,38 @@
+"""Markov chains against the covariance of the fit, where both should say the same."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from calibration.identify import identify
+from calibration.posterior import posterior
+
+
+@pytest.mark.slow
+def test_one_term_has_the_posterior_that_its_covariance_says(experiment):
+    curves = experiment(1, samples=200, disks=(4e-3,), voltages=(0.0, 1500.0))
+    found = identify(curves, terms=1)
+    chains = posterior(curves, found, steps=2500)
+    assert chains.converged
+    assert 0.2 < chains.acceptance < 0.8
+    for name in ("eps_r", "stiffness", "alpha1"):
+        quantity, sampled = found.quantities[name], chains.quantities[name]
+        fitted = [
+            quantity.budget[part] for part in ("noise", "force zero", "displacement zero") if part in quantity.budget
+        ]
+        assert sampled.deviation == pytest.approx(float(np.linalg.norm(fitted)), rel=0.2), name
+        assert abs(sampled.mean - quantity.value) < 0.5 * sampled.deviation
+        assert sampled.high - sampled.low == pytest.approx(2 * 1.96 * sampled.deviation, rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_chain_that_is_too_short_says_so(experiment):
+    curves = experiment(1, samples=200, disks=(4e-3,), voltages=(0.0, 1500.0))
+    assert not posterior(curves, identify(curves, terms=1), steps=60).converged
+
+
+def test_emcee_is_imported_only_when_asked_for():
+    code = "import sys, calibration.posterior, rig.identification; sys.exit('emcee' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
