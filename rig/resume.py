@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -58,13 +58,12 @@ def prepare_resumed(
     if now_ns is None:
         now_ns = round(calendar_now().timestamp() * 1e9) if scene.on_real_ports else VIRTUAL_EPOCH_NS
     still_valid = _still_valid(log, protocol, first, now_ns)
-    rest = plan_from(protocol, scene, first, still_valid)
     ended = datetime.fromtimestamp(log.end_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M UTC")
     question = (
         f"Going on at step {first} of {len(protocol.step)}. Is specimen {scene.specimen.name} still mounted as the run "
         f"of {ended} left it, and nothing in the way of the stage, which finds its reference position first?"
     )
-    actions = [Action(first, "prompt", question, (0, 0), (0, 0), 0.0), *rest]
+    actions = actions_from(protocol, scene, first, still_valid, question)
     plan(protocol, scene)  # what is left must belong to a protocol that can be carried out
     return Experiment(
         scene,
@@ -83,6 +82,13 @@ def prepare_resumed(
         },
         stored_zero=_force_zero(log),
     )
+
+
+def actions_from(
+    protocol: Protocol, scene: Scene, first: int, still_valid: Collection[int], question: str
+) -> list[Action]:
+    """What a resumed run does: the question whether all is as it was, and the rest of the protocol."""
+    return [Action(first, "prompt", question, (0, 0), (0, 0), 0.0), *plan_from(protocol, scene, first, still_valid)]
 
 
 def _text(log: Log, name: str) -> str:

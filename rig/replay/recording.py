@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from calibration.certificate import Certificate, CertificateError, parse_certificate
-from rig.errors import LimitError
+from rig.errors import ConfigError, LimitError
 from rig.experiment import ON_PORTS, Experiment
 from rig.log import schema
 from rig.log.errors import LogError
 from rig.log.reader import Log, read_log
-from rig.plan import plan
+from rig.plan import Action, plan
 from rig.protocol import Protocol
+from rig.resume import actions_from
 from rig.scene import Scene
 from rig.toml_file import parse_table
 
@@ -74,10 +75,22 @@ class Recording:
         scene = parse_table(scene_text, Scene, "scene", where.format("scene.toml"))
         protocol = parse_table(protocol_text, Protocol, "protocol", where.format("protocol.toml"))
         try:
-            actions = plan(protocol, scene)
-        except LimitError as error:
+            actions = self._actions(protocol, scene)
+        except (ConfigError, LimitError) as error:
             raise LogError(self.log.path, f"its protocol cannot be planned today ({error})") from None
         return Experiment(scene, scene_text, protocol, protocol_text, self.certificates, actions, [])
+
+    def _actions(self, protocol: Protocol, scene: Scene) -> list[Action]:
+        """Of the whole protocol; of a run that took up another one, of what that had left."""
+        resumed = self.log.metadata.get("resumed")
+        if resumed is None:
+            return plan(protocol, scene)
+        try:
+            first = int(resumed["at_step"])
+            still_valid = {int(step) for step in resumed.get("preconditioning_still_valid", "").split()}
+        except (KeyError, ValueError):
+            raise LogError(self.log.path, "does not say at which step it was resumed") from None
+        return actions_from(protocol, scene, first, still_valid, "Is all as the other run left it?")
 
     @cached_property
     def certificates(self) -> dict[str, Certificate]:

@@ -13,6 +13,7 @@ from rig.replay.fixtures import LOGS
 from rig.replay.recording import load_recording
 from rig.replay.rerun import rerun
 from rig.replay.verify import verify
+from rig.resume import prepare_resumed
 
 
 class Keys:
@@ -62,4 +63,17 @@ def test_a_pause_under_voltage(tmp_path, monkeypatch, steered):
     assert recording.log.outcome["status"] == "complete"
     assert verify(recording).exit_code == 0
     found = rerun(recording, steered=steered)
+    assert found.exit_code == 0, found.report
+
+
+@pytest.mark.slow
+def test_a_run_that_took_up_another_one(tmp_path, monkeypatch):
+    with monkeypatch.context() as once:
+        recorded_with({211: "s"}, tmp_path, once)
+    taken_up = tmp_path / "rest.mcap"
+    run(prepare_resumed(tmp_path / "run.mcap"), taken_up, lambda done, total, label: None)
+    recording = load_recording(taken_up)
+    assert recording.log.metadata["resumed"]["log"] == "run.mcap"
+    assert verify(recording).exit_code == 0
+    found = rerun(recording)
     assert found.exit_code == 0, found.report
