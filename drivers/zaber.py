@@ -336,6 +336,8 @@ class ZaberStage:
         self._now = self._next_poll = 0.0
         self._ready = self._closed = False
         self._waiting_commands = 0
+        self._next_motion: tuple[str, int | None] | None = None  # asked for, and not begun to be sent
+        self._shown = "--"  # the flag in the last reply
         self._accepted_at = -math.inf
         self._busy = self._homing = False
         self._flags: tuple[str, ...] = ()
@@ -529,15 +531,21 @@ class ZaberStage:
         self._judge()
 
     def _begin_motion(self, words: str, *, max_speed: int | None = None) -> None:
-        self._waiting_commands += 1
-        self._dialogue.begin(self._motion(words, max_speed))
+        queued, self._next_motion = self._next_motion, (words, max_speed)
+        if queued is None:
+            self._waiting_commands += 1
+            self._dialogue.begin(self._motion())
         self._next_poll = self._now
 
-    def _motion(self, words: str, max_speed: int | None) -> Script[_Command, Reply]:
+    def _motion(self) -> Script[_Command, Reply]:
+        """The newest motion asked for: those that came while another was being sent have been replaced by it."""
+        assert self._next_motion is not None
+        (words, max_speed), self._next_motion = self._next_motion, None
         try:
-            yield from self._check_reference(words)
-            if self._flags:
-                yield from self._ask("warnings clear")
+            if not self._keeps_going(words):
+                yield from self._check_reference(words)
+                if self._flags:
+                    yield from self._ask("warnings clear")
             if max_speed is not None and max_speed != self._max_speed:
                 yield from self._ask(f"set maxspeed {max_speed}")
                 self._max_speed = max_speed
@@ -553,8 +561,18 @@ class ZaberStage:
                 answer = yield from self._ask(words, repeat=False)
             self._homing = words == "home"
             self._accept(answer)
+            if self._next_motion is not None and self._schedule.take(self._now):
+                yield from self._watch()  # however fast motions follow each other, positions come in between
         finally:
             self._waiting_commands -= 1
+
+    def _keeps_going(self, words: str) -> bool:
+        """Whether a motion only replaces one under way, whose last reply showed no more than a note.
+
+        A reply shows the weightiest flag; the lost reference and every fault weigh more than a note (N.).
+        """
+        shown = self._shown == "--" or self._shown.startswith("N")
+        return words.startswith("move abs") and self._busy and not self._homing and self._referenced and shown
 
     def _check_reference(self, words: str) -> _Part[None]:
         yield from self._read_flags()
@@ -565,6 +583,7 @@ class ZaberStage:
     def _halt(self, words: str) -> None:
         if self._ready:
             self._dialogue.clear()
+        self._next_motion = None
         self._urgent.clear()
         self._waiting_commands = 1
         self._urgent.begin(self._halting(words))
@@ -587,6 +606,7 @@ class ZaberStage:
     ) -> _Part[Answer[Reply]]:
         answer = yield Ask(_Command(words, self._axis if axis is None else axis), repeat=repeat)
         reply = answer.message
+        self._shown = reply.warning
         if reply.busy:
             self._busy = True
         elif answer.sent >= self._accepted_at:

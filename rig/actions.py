@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -296,7 +296,7 @@ def _ramp_to(engine: Engine, target: float, limit: float) -> Turns:
 
 def _prompt(engine: Engine, action: Action) -> Turns:
     """Ask the operator; whoever is asked may touch the rig, so the voltage is off and latched before."""
-    yield from _take_down(engine, "the operator is asked")
+    yield from take_down(engine, "the operator is asked")
     yield from engine.ask(Question(action.label))
 
 
@@ -317,7 +317,10 @@ def _clear_faults(engine: Engine) -> Turns:
     guard = engine.guard
     if guard is None or guard.last is None or not guard.last.flags & TRIP:
         return
-    words = f"hv: the supply has latched: {flag_names(guard.last.flags & TRIP)}. Cause found and removed?"
+    words = f"hv: the supply has latched: {flag_names(guard.last.flags & TRIP)}."
+    if engine.control.unattended:
+        raise FaultError(f"{words} Nobody is there to find the cause and remove it; nothing was cleared.")
+    words += " Cause found and removed?"
     said = yield from engine.ask(Question(words, expected="clear"))
     guard.clear_faults(str(said))
     last = guard.last
@@ -328,7 +331,7 @@ def choose_about_live_output(engine: Engine) -> Turns:
     """A supply found live is reported and left alone; the operator may choose to have it taken down."""
     guard = engine.guard
     assert guard is not None
-    if guard.last is None or not (guard.last.voltage >= SAFE_VOLTAGE or HVFlag.ON in guard.last.flags):
+    if guard.last is None or (abs(guard.last.voltage) < SAFE_VOLTAGE and HVFlag.ON not in guard.last.flags):
         return
     found = f"hv: the output is live, measured {guard.last.voltage:.0f} V, though nobody switched it on from here."
     engine.recorder.event("warning", "hv", found)
@@ -343,14 +346,17 @@ def choose_about_live_output(engine: Engine) -> Turns:
     yield from _until_off(engine, limit)
 
 
-def _take_down(engine: Engine, cause: str) -> Turns:
-    """Ramp the voltage down, latch, and yield until it has been measured off. The operator's word is used up."""
+def take_down(engine: Engine, cause: str) -> Turns:
+    """Ramp the voltage down, latch, and yield until it has been measured off.
+
+    The operator's word is used up in any case: from here on somebody may touch the rig.
+    """
+    engine.arming.withdraw()
     guard = engine.guard
     if guard is None or guard.state is GuardState.SAFE:
         return
     limit = guard.ramp_duration * PATIENCE + GRACE_S
     guard.ramp_off(cause)
-    engine.arming.withdraw()
     yield from _until_off(engine, limit)
 
 
@@ -368,14 +374,27 @@ def _until_off(engine: Engine, limit: float) -> Turns:
 
 def rest(engine: Engine, action: Action) -> Turns:
     """The operator's pause: stage standing, voltage measured off, until he continues; then back to where ``action``
-    begins, with its voltage, so that it can be carried out anew."""
-    engine.stop_stage()
-    yield from _wait(engine, lambda: not engine.bench.stage.moving, GRACE_S, "The stage's standstill")
-    yield from _take_down(engine, "the operator's pause")
-    engine.control.say("Paused: the stage stands" + (", the voltage is off." if engine.guard is not None else "."))
-    while engine.control.pausing:
-        yield
-    engine.event("operator", "continues")
+    begins, with its voltage, so that it can be carried out anew. He may ask for another pause on the way back."""
+    while True:
+        engine.stop_stage()
+        yield from _wait(engine, lambda: not engine.bench.stage.moving, GRACE_S, "The stage's standstill")
+        yield from take_down(engine, "the operator's pause")
+        engine.control.say("Paused: the stage stands" + (", the voltage is off." if engine.guard is not None else "."))
+        while engine.control.pausing:
+            yield
+        engine.event("operator", "continues")
+        with closing(_regain(engine, action)) as turns:
+            for _ in turns:
+                yield
+                if engine.control.pausing:
+                    engine.event("operator", f"paused again by {engine.control.pausing}")
+                    break
+            else:
+                return
+
+
+def _regain(engine: Engine, action: Action) -> Turns:
+    """Voltage and displacement with which ``action`` begins."""
     voltage, hv = action.voltage[0], engine.bench.scene.hv
     if hv is not None and voltage > 0 and (action.voltage[1] > 0 or action.moves):
         yield from _ramp_to(engine, voltage, voltage / hv.ramp_V_per_s * PATIENCE + GRACE_S)

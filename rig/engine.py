@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
 SETUP_LIMIT_S = 15.0
 SNAPSHOT_S = 1.0  # before and after what ended a run under voltage: the log holds every sample of it, and says where
+ROUNDING_S = 1e-6  # of clock times: whether a turn is the last one must not hang on the last digit
+HANDS = ("prompt", "mount", "weigh", "creep")  # kinds of actions in which the operator touches the rig
 OUTPUT_LIMIT_S = 3.0  # how long a supply may take after set-up to be measured off
 
 
@@ -226,7 +228,7 @@ class Engine:
             self._appoint_guard()
             self._set_up()
             self._watch = Watch(self.bench, self.recorder, self.limits, self.guard)
-            if self.highest_voltage > 0:
+            if self.highest_voltage > 0 and not self._hands_come_first():
                 self._take_turns(confirm_voltage(self))
             self._carry_out_all()
         except Stopped as caught:
@@ -243,7 +245,10 @@ class Engine:
         ended = self.clock.now()
         snapshot = status in ("limit", "fault") and self.guard is not None and self.guard.commanded
         rest = Teardown(self.bench, self.guard, self.recorder, self.control).run(
-            reason, error is None or _lets_ramp_down(error), self._next_turn, ended + SNAPSHOT_S if snapshot else ended
+            reason,
+            error is None or _lets_ramp_down(error),
+            self._next_turn,
+            ended + SNAPSHOT_S - ROUNDING_S if snapshot else ended,
         )
         if snapshot:
             self.recorder.snapshot(reason, ended, SNAPSHOT_S, SNAPSHOT_S)
@@ -253,6 +258,15 @@ class Engine:
         if error is not None:
             self.recorder.event("error", "engine", reason)
         return self._outcome(status, reason, rest), error
+
+    def _hands_come_first(self) -> bool:
+        """Whether somebody may touch the rig before there is voltage: then it is confirmed after that."""
+        for action in self._actions:
+            if action.kind in HANDS:
+                return True
+            if max(action.voltage) > 0:
+                return False
+        return False
 
     def _appoint_guard(self) -> None:
         scene, process = self.bench.scene, self.bench.guard_process

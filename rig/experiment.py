@@ -124,7 +124,7 @@ def run(
         problems = _check_dates(experiment.certificates, bench.clock)
         with (
             _log(out, experiment.scene) as log,
-            closing(Control([] if in_memory else _sources(out), consent.answers, say)) as control,
+            closing(Control([] if in_memory else _sources(out), consent.answers, say, slow=not in_memory)) as control,
             stop_on_signals(control, control.ask_pause),
         ):
             _attach(log, experiment, problems, _this_origin() if origin is None else origin)
@@ -149,6 +149,8 @@ def run(
                 log.finish(outcome.as_text())
         if error is None and not outcome.safe:
             error = FaultError(f"The protocol ended, but the high voltage could not be proved off. {ADVICE}")
+        if error is None and not outcome.standing:
+            error = FaultError("The protocol ended, but the stage did not say that it stands. Cut its power.")
         if error is not None:
             raise error
     except Exception as error:

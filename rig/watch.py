@@ -141,7 +141,7 @@ class Watch:
             self._seen_off = False
         elif guard.output_is_safe and not on:
             self._seen_off = True
-        elif self._seen_off and (sample.voltage >= SAFE_VOLTAGE or on):
+        elif self._seen_off and (not abs(sample.voltage) < SAFE_VOLTAGE or on):
             raise FaultError(
                 f"hv: the output is live ({sample.voltage:.0f} V) though nobody switched it on from here. "
                 "Find out who did; take it down by hand; start again."

@@ -39,6 +39,7 @@ BEATS, MODEL = "interval between heartbeats", "answer of the film's model"
 TRIALS = BEATS, MODEL
 ALLOWED_MS = {KILLED: 50.0, STOPPED: 200.0, SPINNING: 200.0, GUARD: 200.0, BEATS: DEADLINE_S * 1e3, MODEL: 2.0}
 QUICK = {KILLED: 20, STOPPED: 6, SPINNING: 6, GUARD: 10}
+TRIES = 5
 FULL = {KILLED: 200, STOPPED: 40, SPINNING: 40, GUARD: 60}
 LATEST_S = 10.0  # an output that is not commanded off by then never will be
 
@@ -147,6 +148,14 @@ def measure(stand: Stand, row: Row, instant: float | None, rng: random.Random) -
     return run
 
 
+def _undisturbed(stand: Stand) -> float:
+    """`whole_run`; a busy machine may hold an engine up for longer than the guard bears, so a few are tried."""
+    for _ in range(TRIES - 1):
+        with suppress(RigError):
+            return whole_run(stand)
+    return whole_run(stand)
+
+
 def kill_many(folder: Path, number: int, at_once: int, seed: int) -> Row:
     """``number`` engines killed at random instants across their runs, ``at_once`` of them side by side."""
     rows = [Row(KILLED) for _ in range(at_once)]
@@ -156,7 +165,7 @@ def kill_many(folder: Path, number: int, at_once: int, seed: int) -> Row:
         rng = random.Random(seed * at_once + k)
         try:
             with Stand(folder / f"stand-{k}", hold_s=1.5) as stand:
-                duration = min(whole_run(stand) for _ in range(2))  # the first has more to read
+                duration = min(_undisturbed(stand) for _ in range(2))  # the first has more to read
                 for _ in range(k, number, at_once):
                     measure(stand, rows[k], rng.uniform(0.0, duration), rng)
         except Exception as error:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drivers.roles import ForceSample, Sample
-from rig.actions import Turns, listening, pause, set_voltage, stand_still
+from rig.actions import Turns, listening, pause, set_voltage, stand_still, take_down
 from rig.control import Question
 from rig.errors import FaultError
 from rig.plan import Action
@@ -38,6 +38,7 @@ def carry_out(engine: Engine, action: Action) -> Turns:
 
 def _mount(engine: Engine, action: Action) -> Turns:
     fixture = action.label.removeprefix("mount: ")
+    yield from take_down(engine, "the operator's hands come near")
     yield from _ask(engine, FIXTURES[fixture], lambda hands: hands.mount(fixture, engine.clock.now()))
 
 
@@ -60,6 +61,7 @@ def _creep(engine: Engine, action: Action) -> Turns:
 
 def _hang(engine: Engine, action: Action) -> Turns:
     have = action.parameters
+    yield from take_down(engine, "the operator's hands come near")
     newtons, error = have["applied"], have["applied_error"]
     text = "Take all weights off the force sensor." if newtons == 0 else f"Hang {action.label} on the force sensor."
     yield from _ask(engine, text, lambda hands: hands.hang(newtons, error, action.label))

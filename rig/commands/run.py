@@ -32,6 +32,8 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
         highest = max(max(action.voltage) for action in experiment.actions)
         if highest > 0 and not arm:
             raise ConfigError(f"This run goes up to {highest:g} V on a real port. If that is meant, add --arm.")
+        if highest > 0 and yes and scene.simulation is None:
+            raise ConfigError("--yes is for simulated benches: on a real one the highest voltage is typed by somebody.")
         consent = Consent(
             "--arm on the command line" if arm else "",
             "--yes on the command line" if yes else "",

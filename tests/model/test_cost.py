@@ -80,7 +80,8 @@ def test_states_without_voltage_pay_no_electrostatics_beside_charged_ones() -> N
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_memory_is_bounded_by_blocks() -> None:
+def test_a_hundred_thousand_states_cost_as_much_each_as_ten_and_no_more_memory_than_a_block() -> None:
+    few = solve_many(FILM, np.linspace(2e-3, 15e-3, 10), 1000.0, tolerance=1e-6, sensitivities=True)
     h = np.linspace(2e-3, 15e-3, 100_000)
     tracemalloc.start()
     try:
@@ -90,3 +91,5 @@ def test_memory_is_bounded_by_blocks() -> None:
         tracemalloc.stop()
     assert found.answered.all()
     assert peak < 200e6
+    each, of_few = found.evaluations.mechanical / h.size, few.evaluations.mechanical / 10
+    assert 1 / 1.2 < each / of_few < 1.2
