@@ -370,6 +370,7 @@ class IsegEDCP:
     A command writes and reads back; a write that got lost is repeated, except switching on. A command that fails
     raises from ``poll`` and takes the commands queued behind it with it. ``emergency_off`` drops whatever is queued or
     under way and is sent by the next poll, answered or not; if it is not confirmed, all modules on the bus are told.
+    ``switch_off`` drops it too, except a ramp that was asked for, which is written first.
 
     Parameters
     ----------
@@ -430,6 +431,7 @@ class IsegEDCP:
         self._nominal = (math.nan, math.nan)
         self._channels = 1
         self._ready = self._lost_settings = False
+        self._wanted_ramp: float | None = None  # percent per second, asked for and not confirmed yet
         self._commands = 0
         self._inbox: deque[CanFrame] = deque()
         self._samples: list[HVSample] = []
@@ -471,6 +473,7 @@ class IsegEDCP:
                 f"The module allows above 0, at most {self._max_ramp:g} %/s: "
                 f"{self._max_ramp / 100 * self._nominal[0]:g} V/s.",
             )
+        self._wanted_ramp = percent
         self._command(self._write_ramp(percent))
 
     def set_current_limit(self, amperes: float) -> None:
@@ -505,6 +508,7 @@ class IsegEDCP:
     def emergency_off(self) -> None:
         self._dialogue.clear()
         self._commands = 0
+        self._wanted_ramp = None
         self._command(self._emergency_off())
 
     def clear(self) -> None:
@@ -754,6 +758,7 @@ class IsegEDCP:
     def _write_ramp(self, percent: float) -> Script[None]:
         yield from self._write_setting(MODULE_RAMP, percent, None, "ramp_percent_per_s")
         self.settings["ramp_V_per_s"] = f"{percent / 100 * self._nominal[0]:.9g}"
+        self._wanted_ramp = None
 
     def _write_kill(self, enabled: bool) -> Script[None]:
         control = ModuleControl((yield from self._integer(MODULE_CONTROL)))
@@ -788,9 +793,18 @@ class IsegEDCP:
         )
 
     def _switch_off(self) -> Script[None]:
+        """Ramp down and switch off, at the ramp that was asked for last; if it cannot be set, at the module's own."""
+        refused: DeviceError | None = None
+        if self._wanted_ramp is not None:
+            try:
+                yield from self._write_ramp(self._wanted_ramp)
+            except DeviceError as error:
+                refused = error
         # An emergency off stays latched: only `clear` takes it back.
         latched = ChannelControl((yield from self._integer(CHANNEL_CONTROL))) & ChannelControl.EMERGENCY_OFF
         yield from self._write_checked(CHANNEL_CONTROL, int(latched), self._channel)
+        if refused is not None:
+            raise refused
 
     def _emergency_off(self) -> Script[None]:
         try:

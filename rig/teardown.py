@@ -15,9 +15,8 @@ from drivers.roles import HVSample
 from rig.bench import Bench
 from rig.control import Control
 from rig.recorder import Recorder
-from rig.safety.guard import ADVICE, AT_ONCE_S, SAFE_VOLTAGE, AnyGuard
+from rig.safety.guard import ADVICE, AT_ONCE_S, NOT_SAFE, AnyGuard, ramp_limit
 
-RAMP_PATIENCE, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
 AGAIN_S = 0.1  # a command that failed is given again at this interval
 LISTEN_S = 2.0  # for a supply that was never commanded: how long to wait for measurements of it
 
@@ -26,8 +25,8 @@ LISTEN_S = 2.0  # for a supply that was never commanded: how long to wait for me
 class Rest:
     """What was measured at the end.
 
-    ``safe``: the output was measured below 60 V twice, or the scene has no HV. ``standing``: the stage said that it
-    stands still.
+    ``safe``: the output was measured off twice (`rig.safety.guard.Guard.output_is_safe`), or the scene has no HV.
+    ``standing``: the stage said that it stands still.
     """
 
     safe: bool
@@ -43,7 +42,7 @@ class Teardown:
         self._recorder = recorder
         self._control = control
         self._told: set[str] = set()
-        self._failed: set[str] = set()  # roles that did not answer when last asked
+        self._failed: set[str] = set()  # roles that did not answer when last asked; hv: not told off since then
         self._again = dict.fromkeys(bench.devices, -math.inf)
 
     def run(self, cause: str, orderly: bool, next_turn: Callable[[float], float], listen_until: float) -> Rest:
@@ -58,8 +57,10 @@ class Teardown:
         commanded = guard is not None and guard.commanded
         hastened = not orderly
         end = clock.now() + (AT_ONCE_S if hastened else self._ramp_limit()) if commanded else clock.now() + LISTEN_S
+        self._stop_stage()  # first: it waits for nobody, and a guard that hangs would keep it moving
+        if "stage" in self._bench.devices:
+            self._attempt("stage", partial(self._poll, "stage"))
         self._off(cause, at_once=hastened)
-        self._stop_stage()
         while self._bench.devices:
             now = self._recorder.turn = clock.now()
             self._control.poll(now)
@@ -68,7 +69,9 @@ class Teardown:
                 hastened, end = True, now + AT_ONCE_S
                 self._off(f"{cause}; hastened", at_once=True)
             for role in sorted(self._bench.devices, key=lambda role: role != "hv"):
-                if not self._attempt(role, partial(self._poll, role)) and now >= self._again[role]:
+                answers = self._attempt(role, partial(self._poll, role), heals=not (role == "hv" and commanded))
+                failed = role in self._failed if role == "hv" else not answers
+                if failed and now >= self._again[role]:
                     self._again[role] = now + AGAIN_S
                     if role == "hv" and hastened:
                         self._off(f"{cause}; again", at_once=True)
@@ -82,13 +85,12 @@ class Teardown:
             clock.sleep_until(next_turn(now))
         rest = Rest(self._safe(), self._standing())
         if not rest.safe:
-            message = f"NOT SAFE: the output was not measured below {SAFE_VOLTAGE:.0f} V. {ADVICE}"
-            self._recorder.event("error", "hv", message)
+            self._recorder.event("error", "hv", f"{NOT_SAFE} {ADVICE}")
         return rest
 
     def _ramp_limit(self) -> float:
         assert self._guard is not None
-        return self._guard.ramp_duration * RAMP_PATIENCE + RAMP_GRACE_S
+        return ramp_limit(self._guard.ramp_duration)
 
     def _off(self, cause: str, *, at_once: bool) -> None:
         guard = self._guard
@@ -106,8 +108,12 @@ class Teardown:
             if isinstance(added, HVSample) and self._guard is not None:
                 self._guard.on_sample(added)
 
-    def _attempt(self, role: str, act: Callable[[], None]) -> bool:
-        """Whether ``act`` succeeded. Any error at all is only reported: here nothing must stand in the way."""
+    def _attempt(self, role: str, act: Callable[[], None], *, heals: bool = True) -> bool:
+        """Whether ``act`` succeeded. Any error at all is only reported: here nothing must stand in the way.
+
+        What ``heals`` takes back that the role failed before. That a supply can be read again does not: the off that
+        was sent to it may be lost, and only another one makes up for it.
+        """
         try:
             act()
         except Exception as error:
@@ -117,7 +123,8 @@ class Teardown:
                 self._told.add(text)
                 self._recorder.event("error", role, text)
             return False
-        self._failed.discard(role)
+        if heals:
+            self._failed.discard(role)
         return True
 
     def _safe(self) -> bool:

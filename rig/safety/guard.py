@@ -31,11 +31,14 @@ DEVIATION_SAMPLES = 2  # ... when this many samples in a row say so
 FROZEN_SAMPLES = 25  # this many equal measurements of voltage and current in a row: last digits are never so quiet
 FROZEN_RAMP_V, FROZEN_RAMP_SAMPLES = 100.0, 3  # nor does a ramp over so much leave so many voltages equal
 FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
+RAMP_PATIENCE, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
 AT_ONCE_S = 5.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
+NOT_SAFE = f"NOT SAFE: the output was not measured off (below {SAFE_VOLTAGE:.0f} V, and the channel off)."
 ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
 CHARGING_PART = 0.2  # what the model may be wrong in the film's charging current
-SAFE_SAMPLES = 2  # consecutive measured voltages below SAFE_VOLTAGE before we call the output safe
+SAFE_SAMPLES = 2  # consecutive samples that show the output off before we call it safe
 
+DRIVEN = HVFlag.ON | HVFlag.RAMPING  # an output that is driven may be low only for now
 TRIP = HVFlag.TRIPPED | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.INTERLOCK_OPEN | HVFlag.ARC | HVFlag.FAULT
 
 
@@ -78,6 +81,7 @@ class Guard:
         self.cause = "not armed"
         self.commanded = False  # whether the supply was ever told anything; until then it is left alone
         self.setpoint = 0.0
+        self.ramps_down = False  # whether the last off was a ramp, which takes its time
         self._supply = supply
         self._limits = limits
         self._film = film
@@ -100,7 +104,10 @@ class Guard:
 
     @property
     def output_is_safe(self) -> bool:
-        """Whether the *measured* voltage has been below 60 V for the last two samples."""
+        """Whether the last two samples show it *measured* below 60 V, not rising, the channel off, no ramp under way.
+
+        A low voltage alone proves nothing: an output that does not obey its off may be on its way up.
+        """
         return self._low_samples >= SAFE_SAMPLES
 
     @property
@@ -109,6 +116,11 @@ class Guard:
         measured = abs(self.last.voltage) if self.last is not None else math.nan
         start = measured if math.isfinite(measured) else self._limits.voltage.high
         return start / self._ramp
+
+    @property
+    def ramp_limit(self) -> float:
+        """Seconds after which an output that is ramped down must have been measured off."""
+        return ramp_limit(self.ramp_duration)
 
     def arm(self) -> None:
         """Leave SAFE. The supply must be measurably off and free of faults.
@@ -161,24 +173,27 @@ class Guard:
         FaultError
             When it is live or unmeasured; nothing is changed then.
         """
+        low = self.last is not None and abs(self.last.voltage) < SAFE_VOLTAGE
+        if self.last is not None and low and HVFlag.ON in self.last.flags:
+            raise FaultError("hv: cannot be used, the channel is on already. Nothing was changed. Switch it off first.")
         if self.last is None or not self.output_is_safe:
             measured = "not measured yet" if self.last is None else f"{self.last.voltage:.0f} V"
             raise FaultError(
                 f"hv: cannot be used, its output is {measured} though nobody switched it on from here. Nothing was "
                 "changed. Find out who did; take it down by hand; start again."
             )
-        if HVFlag.ON in self.last.flags:
-            raise FaultError("hv: cannot be used, the channel is on already. Nothing was changed. Switch it off first.")
 
     def take_down(self, cause: str) -> None:
         """Ramp down and switch off an output that was found live, by the operator's choice; the latch stays SAFE."""
-        self.commanded = True
+        self.commanded = self.ramps_down = True
         self._low_samples = 0
         try:
             self._tell("take_down", f"ramp {self._ramp!r} V/s; {cause}")
         finally:
-            self._supply.set_ramp(self._ramp)
-            self._supply.switch_off()
+            try:
+                self._supply.set_ramp(self._ramp)
+            finally:
+                self._supply.switch_off()
 
     def clear_faults(self, cause: str) -> None:
         """Clear what the supply has latched, an earlier emergency off for one, by the operator's choice; leaves it off.
@@ -313,7 +328,9 @@ class Guard:
         """
         before, self.last = self.last, sample
         below = abs(sample.voltage) < SAFE_VOLTAGE  # False for NaN
-        self._low_samples = self._low_samples + 1 if below else 0
+        rises = before is not None and abs(sample.voltage) > abs(before.voltage) + AWAY_V
+        off = below and not rises and not sample.flags & DRIVEN
+        self._low_samples = self._low_samples + 1 if off else 0
         if self.commanded and not below:
             self._judge_frozen(sample)
         if self.state is not GuardState.LIVE:
@@ -398,7 +415,7 @@ class Guard:
         """Ramp the output down, switch it off and latch SAFE. For orderly ends; does nothing unless armed or live."""
         if self.state is GuardState.SAFE:
             return
-        self._latch(cause)
+        self._latch(cause, ramps_down=True)
         try:
             self._tell("switch_off", cause)
         finally:
@@ -408,17 +425,23 @@ class Guard:
         """Take the output off at once and latch SAFE. A supply that was never armed is left alone."""
         if not self.commanded:
             return
-        self._latch(cause)
+        self._latch(cause, ramps_down=False)
         try:
             self._tell("emergency_off", cause)
         finally:
             self._supply.emergency_off()
 
-    def _latch(self, cause: str) -> None:
+    def _latch(self, cause: str, *, ramps_down: bool) -> None:
         self.state = GuardState.SAFE
+        self.ramps_down = ramps_down
         self.cause = cause
         self.setpoint = 0.0
         self._low_samples = 0
+
+
+def ramp_limit(duration: float) -> float:
+    """How long a ramp down that should take ``duration`` may take in all (s)."""
+    return duration * RAMP_PATIENCE + RAMP_GRACE_S
 
 
 def flag_names(flags: Flag) -> str:

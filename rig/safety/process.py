@@ -18,7 +18,7 @@ import os
 import select
 import signal
 import socket
-import sys
+import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +35,7 @@ from rig.log.errors import LogError
 from rig.log.remote import RemoteLog
 from rig.recorder import Severity
 from rig.safety.channel import Channel, ChannelDamaged, Message
-from rig.safety.guard import ADVICE, AT_ONCE_S, SAFE_VOLTAGE, Guard, GuardState
+from rig.safety.guard import ADVICE, AT_ONCE_S, NOT_SAFE, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.safety.supply import ROLE, Link, SupplyTable, make_driver, open_link
 from rig.scene import Scene
@@ -45,6 +45,8 @@ STATE_S = 0.05  # how often the engine hears from us at least
 AGAIN_S = 0.1  # a command that failed is given again at this interval
 INSIST_S = 1.0  # an off that was sent but is not measured is sent again at this interval
 TRY_S = 20.0  # how long a supply that does not obey is told again after the engine has gone
+SPEAK_S = 1.0  # how long the last word may wait for a terminal that takes nothing
+STDERR = 2
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 MAY_BE_CALLED = (
     "arm",
@@ -122,7 +124,10 @@ class Server:
         self._log: RemoteLog | None = None
         self._next_state = 0.0
         self._again = 0.0
-        self._off_at: float | None = None  # when the output was first taken off
+        self._off_at: float | None = None  # when the output was taken off that is not measured off yet
+        self._off_limit = 0.0  # ... after which time it must be measured off
+        self._off_ramps = False  # ... and whether that was an orderly ramp
+        self._voice = Voice()
         self._told_not_safe = False
         self._dismissed = False
 
@@ -135,8 +140,9 @@ class Server:
             except Exception as error:  # whatever it is, the output goes off first
                 self._fault(error)
             self._wait()
-        if self._guard is not None and self._guard.commanded and not self._dismissed:
-            self._leave(self._guard)
+        guard = self._guard
+        if guard is not None and guard.commanded and not (self._dismissed and _measured_off(guard)):
+            self._leave(guard)
 
     def close(self) -> None:
         """Let go of the log."""
@@ -178,6 +184,7 @@ class Server:
 
     def _wait(self) -> None:
         now = self._clock.now()
+        self._voice.speak()
         self._tick_log(now)
         due = self._supply.next_poll if self._supply is not None else now + LONGEST_TURN_S
         wait = min(max(due - now, SHORTEST_TURN_S), LONGEST_TURN_S)
@@ -191,13 +198,17 @@ class Server:
         guard = self._guard
         if guard is not None and guard.state is not GuardState.SAFE:
             self._off(guard, str(error) or repr(error))
-        elif guard is not None and self._off_at is not None and isinstance(error, DeviceError):
-            self._again = min(self._again, self._clock.now() + AGAIN_S)
+        elif guard is not None and guard.commanded and not guard.output_is_safe and isinstance(error, DeviceError):
+            if guard.ramps_down:  # the switch-off may be what failed
+                self._off(guard, f"{guard.cause}; hastened, {error}")
+            else:
+                self._again = min(self._again, self._clock.now() + AGAIN_S)
         self._channel.send({"is": "error", "error": pack_error(error)})
+        if guard is not None:  # the turn that failed has not come so far
+            self._insist(guard, self._clock.now())
 
     def _off(self, guard: Guard, cause: str) -> None:
         """Take the output off and send that in this very turn."""
-        self._note_off(guard)
         try:
             guard.kill(cause)
             if self._supply is not None:
@@ -205,25 +216,29 @@ class Server:
         except Exception as error:
             self._channel.send({"is": "error", "error": pack_error(error)})
 
-    def _note_off(self, guard: Guard) -> None:
-        """An off is on its way: from now on it has to show in what is measured."""
-        if guard.commanded:
-            now = self._clock.now()
-            self._off_at = now if self._off_at is None else self._off_at
-            self._again = now + INSIST_S
-
     def _insist(self, guard: Guard, now: float) -> None:
-        """Off is what was measured: until then it is sent again, and after a while called by its name."""
-        if self._off_at is None:
+        """Off is what was measured: until then it is sent again, and after a while called by its name.
+
+        An orderly ramp is given its time, whoever asked for it and whether that one still lives; then it is cut short.
+        """
+        if not guard.commanded or guard.state is not GuardState.SAFE or guard.output_is_safe:
+            self._off_at, self._told_not_safe = None, False
             return
-        if guard.output_is_safe:
-            self._off_at = None
-        elif now - self._off_at > AT_ONCE_S and not self._told_not_safe:
+        if self._off_at is None or (self._off_ramps and not guard.ramps_down):
+            self._off_at, self._off_ramps = now, guard.ramps_down
+            self._off_limit = guard.ramp_limit if guard.ramps_down else AT_ONCE_S
+            self._again = now + INSIST_S
+        late = now - self._off_at > self._off_limit
+        if self._off_ramps:
+            if late:
+                self._off(guard, f"{guard.cause}; hastened, the ramp has taken {now - self._off_at:.0f} s")
+        elif late and not self._told_not_safe:
             self._told_not_safe = True
-            message = f"NOT SAFE: the output was not measured below {SAFE_VOLTAGE:.0f} V. {ADVICE}"
+            message = f"{NOT_SAFE} {ADVICE}"
             self._tell_event("error", message)
-            _say(f"dea-rig guard: {message}")
+            self._voice.say(f"dea-rig guard: {message}")
         elif now >= self._again:
+            self._again = now + INSIST_S
             self._off(guard, guard.cause)
 
     # What the engine asks --------------------------------------------------------------------------------------
@@ -263,8 +278,6 @@ class Server:
             if name not in MAY_BE_CALLED:
                 raise FaultError(f"hv: the guard cannot be asked for {name!r}.")
             getattr(guard, name)(*message["args"])
-            if name == "kill":
-                self._note_off(guard)
         except Exception as caught:
             error = pack_error(caught)
         if guard is not None and supply is not None:
@@ -338,13 +351,14 @@ class Server:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _leave(self, guard: Guard) -> None:
-        """The engine has gone without taking leave, from a supply that it had commanded."""
+        """The engine has gone without taking leave, or from a supply that it had commanded and not measured off."""
         cause = "the engine has ended without taking leave"
+        if self._dismissed:
+            cause = "the engine has ended before the output was measured off"
         began = self._clock.now()
-        safe = guard.state is GuardState.SAFE
-        if safe:
+        if guard.state is GuardState.SAFE:
             cause = f"{cause}, after {guard.cause}"
-        if not (safe and guard.output_is_safe):
+        if not _measured_off(guard):
             self._off(guard, cause)
         while not guard.output_is_safe and self._clock.now() - began < TRY_S:
             try:
@@ -360,14 +374,40 @@ class Server:
         else:
             message = f"{cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {ADVICE}"
         self._tell_event("error", message)
-        _say(f"dea-rig guard: {message}")
+        self._voice.say(f"dea-rig guard: {message}")
+        end = time.monotonic() + SPEAK_S
+        while not self._voice.speak() and time.monotonic() < end:
+            time.sleep(LONGEST_TURN_S)
 
 
-def _say(text: str) -> None:
-    """To the terminal, if there still is one."""
-    with suppress(OSError, ValueError):
-        click.echo(text, err=True)
-        sys.stderr.flush()
+def _measured_off(guard: Guard) -> bool:
+    return guard.state is GuardState.SAFE and guard.output_is_safe
+
+
+class Voice:
+    """To the terminal, if there still is one. One that takes nothing (stopped by Ctrl-S) holds nobody up."""
+
+    def __init__(self) -> None:
+        self._unsaid = b""
+
+    def say(self, text: str) -> None:
+        """Say it as far as it can be said at once; `speak` says the rest."""
+        if os.name == "posix":
+            self._unsaid += f"{text}\n".encode()
+            self.speak()
+        else:  # there is no way to ask a console whether it would take it
+            with suppress(OSError, ValueError):
+                click.echo(text, err=True)
+
+    def speak(self) -> bool:
+        """Whether everything is said. Byte by byte: the room for one is all that a terminal promises."""
+        try:
+            while self._unsaid and select.select([], [STDERR], [], 0)[1]:
+                os.write(STDERR, self._unsaid[:1])
+                self._unsaid = self._unsaid[1:]
+        except (OSError, ValueError):  # nobody is there to hear it
+            self._unsaid = b""
+        return not self._unsaid
 
 
 def pack_error(error: Exception) -> Message:

@@ -35,7 +35,7 @@ START_S = 30.0  # until the process must have opened the link; a slow disk has m
 ANSWER_S = 1.0  # a guard that takes longer to answer is lost
 SILENCE_S = 1.0  # ... and one that says nothing for this long: it sends its state twenty times a second
 OPEN_AGAIN_S = 0.1
-LEAVE_S = 5.0  # a guard that was told to go must have gone by then
+LEAVE_S = 5.0  # a guard that was told to go, and has nothing to take off, must have gone by then
 
 _ERRORS = {kind.__name__: kind for kind in (LimitError, FaultError, StaleData)}
 _DEVICE_ERRORS = {kind.__name__: kind for kind in (DeviceLost, DeviceSilent, DeviceRefused)}
@@ -188,7 +188,8 @@ class RemoteGuard:
         """Let the process end, and see that it does. Calling it twice does no harm."""
         if not self._channel.closed:
             self._channel.send({"do": "close"})
-            self._process.join(LEAVE_S)
+            # One that has commanded the output first sees that it is measured off, for as long as it may try.
+            self._process.join(LEAVE_S + (process.TRY_S if self.commanded else 0.0))
             self._channel.close()
         self._process.join(LEAVE_S)
         if self._process.is_alive():  # it hangs; nothing may wait for it

@@ -91,14 +91,12 @@ ENDS: dict[tuple[str, str], str] = {
         OFF,
     ),
     **dict.fromkeys(
-        [
-            ("iseg-edcp", kind)
-            for kind in ("reset", "wrong_status", "breakdown", "over_current", "sag", "interlock", "inhibit")
-        ],
+        [("iseg-edcp", kind) for kind in ("reset", "breakdown", "over_current", "sag", "interlock", "inhibit")],
         OFF,
     ),
     **dict.fromkeys([("shvps", kind) for kind in ("reset", "wrong_status", "breakdown", "over_current", "sag")], OFF),
-    # Nothing proves the output off of a supply that cannot be heard, does not obey, or shows the same for ever.
+    # Nothing proves the output off of a supply that cannot be heard, does not obey, or shows the same for ever ...
+    ("iseg-edcp", "wrong_status"): NOT_SAFE,  # ... or says that its channel is on and ramps
     **dict.fromkeys(
         [(supply, kind) for supply in ("iseg-edcp", "shvps") for kind in ("silent", "vanish", "stuck_on", "freeze")],
         NOT_SAFE,

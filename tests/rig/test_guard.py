@@ -231,6 +231,18 @@ def test_off_is_believed_only_when_measured_twice() -> None:
         assert guard.output_is_safe is safe
 
 
+def test_a_low_voltage_is_not_off_while_the_channel_is_on_a_ramp_is_under_way_or_the_voltage_rises() -> None:
+    guard, _, _ = live()
+    guard.ramp_off("end")
+    ramping = HVFlag.RAMPING
+    story = [(5.0, HVFlag.ON), (5.0, HVFlag.ON), (9.0, HVFlag.ON | ramping), (50.0, ramping), (20.0, ramping)]
+    for voltage, flags in [*story, (0.0, OFF), (10.0, OFF), (20.0, OFF), (20.0, OFF)]:
+        guard.on_sample(sample(voltage, flags))
+        assert not guard.output_is_safe
+    guard.on_sample(sample(20.0))
+    assert guard.output_is_safe
+
+
 def at(
     t: float, voltage: float, flags: HVFlag = HVFlag.ON, current: float = 5e-8, setpoint: float = 1000.0
 ) -> HVSample:
