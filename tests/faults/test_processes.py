@@ -16,6 +16,8 @@ import pytest
 from rig.benchmark.safety import kill_many
 from rig.benchmark.stand import Run, Stand
 from rig.log.reader import read_log
+from rig.safety.guard import AT_ONCE_S
+from rig.safety.remote import LEAVE_S
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault
 
@@ -180,6 +182,22 @@ def test_engine_killed_with_a_supply_that_does_not_obey_is_called_not_safe(stand
     stand.wait_until_alone(live)  # it was told again meanwhile, and obeys now
     stays_off(stand, at)
     assert "The high voltage is off, measured" in live.said
+
+
+@pytest.mark.slow
+def test_a_guard_whose_engine_takes_leave_of_a_live_output_stays_and_tries_on(stand: Stand, live: Run) -> None:
+    stand.do(lambda bench: bench.inject(Fault(role="hv", kind="stuck_on")))
+    at = stand.kill(live.engine, signal.SIGINT)
+    stand.kill(live.engine, signal.SIGINT)
+    stand.wait(lambda: "dea-rig guard: NOT SAFE" in live.said, "the guard's word")
+    # By then the engine has given up; a guard that it dismissed would be gone, or killed for not going.
+    stand.wait(lambda: stand.bench.clock.now() > at + AT_ONCE_S + 2 * LEAVE_S + 1.0, "the guard's patience")
+    assert stand.bench.voltage() > 780.0
+    stand.do(lambda bench: setattr(bench.instruments["hv"], "stuck_on", False))
+    stand.wait_until_alone(live)
+    stays_off(stand, at)
+    assert "before the output was measured off" in live.said and "The high voltage is off, measured" in live.said
+    assert live.status == 130 and read_log(live.log).outcome["safe"] == "NO"  # type: ignore[index]
 
 
 @pytest.mark.slow
