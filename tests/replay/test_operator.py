@@ -34,7 +34,9 @@ class Keys:
 
 
 def recorded_with(typed, folder, monkeypatch):
-    monkeypatch.setattr("rig.experiment.Control", lambda sources, answers, say: Control([Keys(typed)], answers, say))
+    monkeypatch.setattr(
+        "rig.experiment.Control", lambda sources, answers, say, **_: Control([Keys(typed)], answers, say)
+    )
     experiment = prepare(LOGS / "no-laser" / "scene.toml", LOGS / "no-laser" / "protocol.toml")
     log = folder / "run.mcap"
     with contextlib.suppress(Stopped):
