@@ -113,7 +113,7 @@ class CanLink:
             return can.Bus(
                 channel=channel, interface=interface, ignore_config=True, receive_own_messages=False, **options
             )
-        except can.CanInterfaceNotImplementedError as error:
+        except can.CanInterfaceNotImplementedError as error:  # python-can's word for a backend that is not installed
             self._release()
             raise DeviceRefused(
                 self._where,

@@ -53,6 +53,7 @@ else:
             return 0
 
 
+# pyserial raises the last one for a baud rate or a setting that this system's ports cannot have.
 _UNUSABLE: tuple[type[Exception], ...] = (*_GONE, ValueError, NotImplementedError)
 
 

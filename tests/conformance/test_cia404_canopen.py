@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-can = pytest.importorskip("can")
 canopen = pytest.importorskip("canopen", reason="needs the conformance dependency group")
 
 from canopen import objectdictionary as od  # noqa: E402

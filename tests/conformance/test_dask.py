@@ -10,7 +10,7 @@ from model.materials import NAMED
 from model.specimen import Specimen
 from model.stroke import Criteria
 
-distributed = pytest.importorskip("distributed")
+distributed = pytest.importorskip("distributed", reason="needs the conformance dependency group")
 pytestmark = pytest.mark.conformance
 
 

@@ -11,13 +11,12 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
+import can
 import pytest
 
 from drivers.can_link import INTERFACES, CanLink
 from drivers.iseg_edcp import IsegEDCP
 from drivers.link import CanFrame, DeviceError, DeviceLost, DeviceRefused, FrameLink
-
-can = pytest.importorskip("can")
 
 _channels = itertools.count()
 
@@ -186,7 +185,7 @@ def test_an_interface_that_cannot_tell_its_state_counts_as_well(
     link, other = pair
 
     def unknown(bus: object) -> None:
-        raise NotImplementedError
+        raise NotImplementedError  # as python-can's `BusABC.state` does for interfaces that do not know it
 
     monkeypatch.setattr(type(link._bus), "state", property(unknown))
     other.send(message(0x200, b"ok"))

@@ -422,7 +422,6 @@ def test_without_names_the_systems_own_buses_are_asked_and_others_listed(monkeyp
 
 
 def test_the_systems_can_channels_are_listed_whatever_drivers_there_are() -> None:
-    pytest.importorskip("can")
     assert all(interface in can_link.INTERFACES and channel for interface, channel in can_link.channels())
 
 

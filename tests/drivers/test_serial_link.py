@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
 
 from drivers.link import ByteLink, DeviceError, DeviceLost
 from drivers.serial_link import PortLock, SerialLink
 
 pty = pytest.importorskip("pty", reason="pseudo-terminals are POSIX")
-termios = pytest.importorskip("termios")
-serial = pytest.importorskip("serial")
+termios = pytest.importorskip("termios", reason="pseudo-terminals are POSIX")
 
 
 class Pty:

@@ -71,13 +71,12 @@ def test_every_sample_comes_out_of_its_bytes_again(real):
 
 def test_the_run_asks_the_same_again_and_ends_the_same(real, request, tmp_path):
     for k in range(2):
-        # A poll that moves no byte leaves no trace; on a busy machine one decides which of two requests goes first.
+        # A poll that moves no byte leaves no trace, nor does an engine's silence by which a guard has judged: on a busy
+        # machine the one decides which of two requests goes first, the other ends a run.
         if rerun(real).exit_code == 0:
             break
         (tmp_path / f"{k}").mkdir()
         real = recorded(request.node.callspec.params["real"], tmp_path / f"{k}")
-    if "guard" in real.log.outcome["reason"]:  # it judges by the engine's silence, of which the wires know nothing
-        pytest.skip(f"the machine was too busy: {real.log.outcome['reason']}")
     assert real.log.outcome["status"] == "complete"
     found = rerun(real)
     assert found.exit_code == 0, found.report
