@@ -9,24 +9,23 @@ sensor's zero must still be near the one taken then.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from calibration.certificate import Certificate, CertificateError, parse_certificate
+from calibration.certificate import Certificate
+from drivers.roles import Identity
 from rig import protocol as steps
 from rig.clock import VIRTUAL_EPOCH_NS, calendar_now
 from rig.errors import ConfigError
 from rig.experiment import Experiment
+from rig.log.contents import certificates_in, identities_in
 from rig.log.reader import Log, read_log
 from rig.plan import Action, check_plan, plan, plan_from
 from rig.protocol import Protocol
 from rig.scene import Scene
 from rig.toml_file import parse_table, validate
-
-_SERIAL = re.compile(r"model .*?, serial (.*?), firmware ")
 
 
 def prepare_resumed(
@@ -53,7 +52,7 @@ def prepare_resumed(
     protocol = parse_table(protocol_text, Protocol, "protocol", f"{path} (protocol.toml inside)")
     if ports is not None:
         scene = scene.with_ports(ports)
-    scene = _with_serials(scene, _serials(log), path)
+    scene = _with_serials(scene, identities_in(log), path)
     first = _next_step(log)
     if now_ns is None:
         now_ns = round(calendar_now().timestamp() * 1e9) if scene.on_real_ports else VIRTUAL_EPOCH_NS
@@ -99,37 +98,20 @@ def _text(log: Log, name: str) -> str:
 
 
 def _certificates(log: Log) -> dict[str, Certificate]:
-    found: dict[str, Certificate] = {}
-    for name, attachment in log.attachments.items():
-        if name.startswith("certificate."):
-            try:
-                certificate = parse_certificate(attachment.data, f"{log.path} ({name} inside)")
-            except CertificateError as error:
-                raise ConfigError(f"{error}.") from None
-            found[certificate.role] = certificate
+    found = certificates_in(log)
     if "force" not in found:
         raise ConfigError(f"{log.path}: holds no certificate of the force sensor, so its run cannot be taken up again.")
     return found
 
 
-def _serials(log: Log) -> dict[str, str]:
-    """The serial number that each instrument stated."""
-    found: dict[str, str] = {}
-    for message in log.messages("/event"):
-        said = _SERIAL.match(message.fields["message"])
-        if said is not None:
-            found.setdefault(message.fields["source"], said[1])
-    return found
-
-
-def _with_serials(scene: Scene, serials: Mapping[str, str], path: Path) -> Scene:
+def _with_serials(scene: Scene, identities: Mapping[str, Identity], path: Path) -> Scene:
     """The scene with the serial numbers of the log's instruments required."""
     raw: dict[str, Any] = scene.model_dump(exclude_none=True)
     for role in scene.instruments:
-        if role not in serials:
+        if role not in identities:
             raise ConfigError(f"{path}: does not say which {role} instrument it was made with: the run never began.")
-        if serials[role]:
-            raw[role]["serial"] = serials[role]
+        if identities[role].serial:
+            raw[role]["serial"] = identities[role].serial
     return validate(raw, Scene, "scene", f"{path} (scene.toml inside, with the serial numbers of its instruments)")
 
 

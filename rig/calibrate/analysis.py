@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 from hashlib import sha256
@@ -14,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.sensor import Characteristic, SensorError, Standstill, characterise
+from drivers.roles import Identity
 from rig.calibrate import steps
 from rig.errors import DataError
+from rig.log.contents import identities_in
 from rig.log.dataset import Phase, Run, load_run
 from rig.protocol import Protocol
 from rig.toml_file import parse_table
@@ -105,14 +106,14 @@ def calibrate(path: Path, quantity: Quantity) -> Calibration:
         except SensorError as error:
             raise DataError(f"{path}: {quantity} cannot be calibrated from this log. {error}") from None
         creep = _creep(run) if quantity == "force" else None
-    model, serial = _identity(run, role)
+    stated = identities_in(run.log).get(role, Identity())
     return Calibration(
         quantity=quantity,
         characteristic=characteristic,
         creep=None if creep is None or characteristic is None else creep * characteristic.gain,
         lags=lags,
-        instrument=model,
-        serial=serial,
+        instrument=stated.model,
+        serial=stated.serial,
         made=datetime.fromtimestamp(run.log.start_ns * 1e-9, UTC).date(),
         data_sha256=sha256(path.read_bytes()).hexdigest(),
         reading_unit=run.log.metadata.get("units", {}).get("force", "mV/V")
@@ -295,15 +296,3 @@ def _student(freedom: int) -> float:
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, 0.975)) / 1.96
-
-
-_SAID = re.compile(r"model (?P<model>.*?), serial (?P<serial>.*?), firmware ")
-
-
-def _identity(run: Run, role: str) -> tuple[str, str]:
-    """Model and serial number that the instrument of ``role`` stated at the start of the run."""
-    for message in run.log.messages("/event"):
-        said = _SAID.match(message.fields["message"])
-        if said and message.fields["source"] == role:
-            return said["model"], said["serial"]
-    return "", ""

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Required, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.log.contents import certificates_in
 from rig.log.errors import LogError
 from rig.log.reader import Columns, Log, read_tables
-from rig.log.text import printable
 
 if TYPE_CHECKING:
     from calibration.certificate import Certificate
@@ -124,7 +124,7 @@ class Run:
     @property
     def certificates(self) -> dict[str, Certificate]:
         """The certificates of the sensors in use, by role."""
-        return _certificates(self.log)
+        return certificates_in(self.log)
 
     def reference(self, name: str, t: float = np.inf) -> Reference | None:
         """The newest reference of that name taken before ``t``."""
@@ -215,7 +215,7 @@ def load_run(path: Path, latency: Mapping[str, float] | None = None) -> Run:
     if "/force/sample" not in log.topics:
         raise LogError(path, "holds no force samples", "There is nothing to align.")
     if latency is None:
-        latency = {role: certificate.lag for role, certificate in _certificates(log).items()}
+        latency = {role: certificate.lag for role, certificate in certificates_in(log).items()}
     late = {role: seconds for role, seconds in latency.items() if seconds}
     times = {topic: tables[topic]["t_s"] - late.pop(topic.split("/")[1], 0.0) for topic in _TOPICS}
     if late:
@@ -253,20 +253,6 @@ def _without_interrupted(phases: list[Phase]) -> list[Phase]:
         phase._replace(record=False) if follower == "pause" else phase
         for phase, follower in zip(phases, followers, strict=False)
     ]
-
-
-def _certificates(log: Log) -> dict[str, Certificate]:
-    found: dict[str, Certificate] = {}
-    for name, attachment in log.attachments.items():
-        if name.startswith("certificate."):
-            from calibration.certificate import CertificateError, parse_certificate
-
-            try:
-                certificate = parse_certificate(attachment.data, f"{printable(name)} inside")
-            except CertificateError as error:
-                raise LogError(log.path, f"holds a certificate that cannot be used: {error}") from None
-            found[certificate.role] = certificate
-    return found
 
 
 def interpolate(t: Floats, sample_t: Floats, values: Floats) -> Floats:

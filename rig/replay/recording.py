@@ -9,10 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from calibration.certificate import Certificate, CertificateError, parse_certificate
+from calibration.certificate import Certificate
 from rig.errors import ConfigError, LimitError
 from rig.experiment import ON_PORTS, Experiment
 from rig.log import schema
+from rig.log.contents import certificates_in
 from rig.log.errors import LogError
 from rig.log.reader import Log, read_log
 from rig.plan import Action, plan
@@ -95,15 +96,7 @@ class Recording:
     @cached_property
     def certificates(self) -> dict[str, Certificate]:
         """By role, those that the log holds."""
-        found: dict[str, Certificate] = {}
-        for name, attachment in self.log.attachments.items():
-            if name.startswith("certificate."):
-                try:
-                    certificate = parse_certificate(attachment.data, f"{self.log.path} ({name} inside)")
-                except CertificateError as error:
-                    raise LogError(self.log.path, str(error)) from None
-                found[certificate.role] = certificate
-        return found
+        return certificates_in(self.log)
 
     @cached_property
     def steps(self) -> list[Step]:

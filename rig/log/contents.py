@@ -1,0 +1,47 @@
+"""What a run leaves inside its log beside the samples: the certificates it used, and who its instruments were."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+from drivers.roles import Identity
+from rig.log.errors import LogError
+from rig.log.reader import Log
+from rig.log.text import printable
+
+if TYPE_CHECKING:
+    from calibration.certificate import Certificate
+
+_SAID = re.compile(r"model (.*?), serial (.*?), firmware (.*?)(?:;|$)")
+
+
+def certificates_in(log: Log) -> dict[str, Certificate]:
+    """The certificates of the sensors in use, by role.
+
+    Raises
+    ------
+    LogError
+        One of them cannot be used.
+    """
+    found: dict[str, Certificate] = {}
+    for name, attachment in log.attachments.items():
+        if name.startswith("certificate."):
+            from calibration.certificate import CertificateError, parse_certificate
+
+            try:
+                certificate = parse_certificate(attachment.data, f"{printable(name)} inside")
+            except CertificateError as error:
+                raise LogError(log.path, f"holds a certificate that cannot be used: {error}") from None
+            found[certificate.role] = certificate
+    return found
+
+
+def identities_in(log: Log) -> dict[str, Identity]:
+    """What each instrument stated of itself at the start of the run, by role."""
+    found: dict[str, Identity] = {}
+    for message in log.messages("/event"):
+        said = _SAID.match(message.fields["message"])
+        if said is not None:
+            found.setdefault(message.fields["source"], Identity(*said.groups()))
+    return found
