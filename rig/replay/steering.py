@@ -3,8 +3,12 @@
 In virtual time a run goes again as it went. In real time no two turns take the same time, and whether a wait ends in
 this turn or the next would be left to chance. So the clock shows, turn by turn, what it showed then; each instrument
 is polled in the turns, and told the times, in which something passed on its wire; turns in which nothing did are left
-out. Where the engine is to decide something (a command, a phase, a reference) the clock stands at the time of that
-decision until it has been taken.
+out.
+
+The order is the log's, never that of the clock. Where the engine is to decide something (a command, a phase, a
+reference) the clock stands at the time of that decision until it has been taken, and nothing is polled meanwhile. A
+decision that comes before its time, because a wait that ended within a turn then ends at its beginning now, lets the
+turns before it happen first. The supply is polled up to its next command, and no further before that has been given.
 """
 
 from __future__ import annotations
@@ -23,8 +27,10 @@ from rig.replay.recording import Recording, Row
 from rig.scene import Scene
 
 DECISIONS = ("/phase", "/target", "/reference", "/command")
+COUNTED = "counted: "  # an event that says so is the end of polling
 NANOSECONDS = 1e-8  # to which the times of turns are known
-PATIENCE_TURNS = 10  # how many turns a decision may come later than then before it is given up
+PATIENCE_S = 0.1  # by how much a decision may come sooner or later than then: less than any device is silent for
+PATIENCE_TURNS = round(PATIENCE_S / SHORTEST_TURN_S)
 
 # The word in the log under which a supply's first call of each command stands.
 WORDS = {
@@ -51,6 +57,16 @@ class _Decision:
 
     t: float
     topic: str
+    place: int  # in the log
+    waited: int = 0
+
+
+@dataclass
+class _Command:
+    """A command to the supply."""
+
+    t: float
+    word: str
     waited: int = 0
 
 
@@ -61,7 +77,11 @@ class Steering:
         self._entries = deque(_entries(recording))
         self._supply = deque(_supply(recording.rows))
         start = recording.start_ns
-        self._taken = deque(_seconds(row.log_ns - start) for row in recording.rows if row.topic == "/hv/sample")
+        self._taken = deque(
+            (_seconds(row.log_ns - start), place)
+            for place, row in enumerate(recording.rows)
+            if row.topic == "/hv/sample"
+        )
         self._turn: _Turn | None = None
         self._in_turn = False
 
@@ -72,7 +92,9 @@ class Steering:
             return wanted
         entry = self._entries[0]
         if isinstance(entry, _Turn):
-            return entry.t
+            # What is decided right after that turn was not due before it, though it may seem so by the turn's time.
+            held = len(self._entries) > 1 and isinstance(self._entries[1], _Decision)
+            return 0.0 if held else entry.t
         entry.waited += 1
         if entry.waited == 1:
             return entry.t
@@ -80,11 +102,25 @@ class Steering:
             self._entries.popleft()
         return wanted
 
-    def decided(self, topic: str, fields: Mapping[str, Any]) -> None:
-        """The engine has written a row."""
-        entry = self._entries[0] if self._entries else None
-        if isinstance(entry, _Decision) and entry.topic == topic and fields.get("device", "stage") == "stage":
-            self._entries.popleft()
+    def decided(self, topic: str, fields: Mapping[str, Any]) -> list[tuple[str, float]]:
+        """The engine writes a row; role and time of the polls that were before that, and have not been yet."""
+        if not _is_decision(topic, fields):
+            return []
+        decision = next((entry for entry in self._entries if isinstance(entry, _Decision)), None)
+        if decision is None or decision.topic != topic or decision.t > fields["t_s"] + PATIENCE_S:
+            return []
+        before: list[_Turn] = []
+        while isinstance(entry := self._entries.popleft(), _Turn):
+            before.append(entry)
+        after = self._entries[0] if self._entries else None
+        if isinstance(after, _Turn) and self._turn is not None and after.t == self._turn.t:
+            self._in_turn = False  # decided in the midst of a turn, which goes on
+        return [(role, t) for turn in before for role, times in turn.polls.items() for t in times]
+
+    @property
+    def turn_began(self) -> float:
+        """When this turn began; 0 where nothing is known of it."""
+        return self._turn.t if self._in_turn and self._turn is not None else 0.0
 
     def polls(self, role: str, now: float) -> list[float]:
         """When ``role`` was polled in this turn; ``now``, where the log has ended."""
@@ -102,31 +138,35 @@ class Steering:
 
     def supply_poll(self, now: float, *, holding: bool) -> float | None:
         """The supply's next poll, if it was before ``now``, or if a sample is to come of it in this very turn."""
-        t = next((item for item in self._supply if isinstance(item, float)), None)
-        coming = self._entries[0] if self._entries else None
-        if isinstance(coming, _Decision) and t is not None and t > coming.t - NANOSECONDS:
-            return None  # that decision may be a command to the supply
-        if t is None or (t > now + NANOSECONDS and (holding or not self.sample_taken())):
+        item = self._supply[0] if self._supply else None
+        if isinstance(item, _Command):
+            if item.t <= now:
+                item.waited += 1
+            if item.waited > PATIENCE_TURNS:
+                self._supply.popleft()
             return None
-        while self._supply.popleft() != t:
-            pass  # a command that was not given
-        return t
+        if item is None or (item > now + NANOSECONDS and (holding or not self.sample_taken())):
+            return None
+        self._supply.popleft()
+        return item
 
     def sample_taken(self) -> bool:
         """Whether the engine took its next sample of the supply in this turn."""
-        return bool(self._taken) and (not self._entries or self._taken[0] < self._entries[0].t)
+        if not self._taken or not self._entries:
+            return bool(self._taken)
+        (t, place), coming = self._taken[0], self._entries[0]
+        return place < coming.place if isinstance(coming, _Decision) else t < coming.t
 
     def take_sample(self) -> None:
         self._taken.popleft()
 
     def supply_polls_before(self, words: Sequence[str]) -> list[float]:
         """When the supply was polled before it was given the next command, if that is one of ``words``."""
-        coming = next((item for item in self._supply if isinstance(item, str)), None)
-        if coming not in words:
+        coming = next((item for item in self._supply if isinstance(item, _Command)), None)
+        if coming is None or coming.word not in words:
             return []
         times = []
-        while (item := self._supply.popleft()) != coming:
-            assert isinstance(item, float)
+        while isinstance(item := self._supply.popleft(), float):
             times.append(item)
         return times
 
@@ -140,39 +180,50 @@ def _seconds(ns: int) -> float:
     return ns * 1e-9
 
 
+def _is_decision(topic: str, fields: Mapping[str, Any]) -> bool:
+    if topic == "/event":
+        return str(fields["message"]).startswith(COUNTED)
+    return topic in DECISIONS and fields.get("device", "stage") == "stage"
+
+
 def _entries(recording: Recording) -> list[_Turn | _Decision]:
     entries: list[_Turn | _Decision] = []
     closed: set[str] = set()
     turn: _Turn | None = None
-    for row in recording.rows:
+    for place, row in enumerate(recording.rows):
         about, written = _seconds(row.about_ns - recording.start_ns), _seconds(row.log_ns - recording.start_ns)
         _, topic, *rest = row.topic.split("/")
         if topic == "raw" and rest[0] != "hv" and rest[0] not in closed:
             if turn is None or about != turn.t:
-                turn = _Turn(about)
-                entries.append(turn)
+                last = entries[-1] if entries else None
+                if isinstance(last, _Turn) and not last.polls and about <= last.t:
+                    turn, last.t = last, about  # the turn whose first row was a sample of the supply
+                else:
+                    turn = _Turn(about)
+                    entries.append(turn)
             times = turn.polls.setdefault(rest[0], [])
             if not times or times[-1] != row.t:
                 times.append(row.t)
         elif row.topic == "/hv/sample":
             if not entries or written - entries[-1].t > SHORTEST_TURN_S:  # a turn in which nothing else was read
                 entries.append(_Turn(written))
-        elif row.topic in DECISIONS and row.fields.get("device", "stage") == "stage":
-            entries.append(_Decision(row.t, row.topic))
-        elif topic == "event" and row.fields["message"].startswith("counted: "):
+        elif _is_decision(row.topic, row.fields) and not closed:
+            entries.append(_Decision(row.t, row.topic, place))
+            turn = None  # what comes in the same turn comes after it
+        if topic == "event" and row.fields["message"].startswith(COUNTED):
             closed.add(row.fields["source"])
     return entries
 
 
-def _supply(rows: Sequence[Row]) -> list[float | str]:
-    """Times of the supply's polls and the words of its commands, in their order."""
-    found: list[float | str] = []
+def _supply(rows: Sequence[Row]) -> list[float | _Command]:
+    """Times of the supply's polls and its commands, in their order."""
+    found: list[float | _Command] = []
     for row in rows:
         if row.topic.startswith("/raw/hv/"):
             if not found or found[-1] != row.t:
                 found.append(row.t)
         elif row.topic == "/command" and row.fields["device"] == "hv":
-            found.append(row.fields["command"])
+            found.append(_Command(row.t, row.fields["command"]))
     return found
 
 
@@ -186,6 +237,10 @@ class _Clock(VirtualClock):
 
     def sleep_until(self, t: float) -> None:
         super().sleep_until(self._steering.next_time(t))
+
+    def begin_turn(self) -> None:
+        """The first instrument is polled: it is at least so late."""
+        super().sleep_until(self._steering.turn_began)
 
     def show(self, t: float) -> float:
         """Show ``t`` for the time of a poll; returns what was shown before."""
@@ -207,13 +262,16 @@ class _Steered:
         return getattr(self._device, name)
 
     def poll(self, now: float) -> Sequence[Sample]:
-        for t in self._steering.polls(self._role, now):
-            self._poll(t)
+        times = self._steering.polls(self._role, now)
+        self._clock.begin_turn()
+        for t in times:
+            self.poll_at(t)
         samples = list(self._samples)
         self._samples.clear()
         return samples
 
-    def _poll(self, t: float) -> None:
+    def poll_at(self, t: float) -> None:
+        """Poll it as at ``t``; what it says is given with the next poll."""
         before = self._clock.show(t)
         try:
             self._samples += self._device.poll(t)
@@ -230,7 +288,7 @@ class _SteeredSupply(_Steered):
         if name in WORDS:
             try:
                 for t in self._steering.supply_polls_before(WORDS[name]):
-                    self._poll(t)
+                    self.poll_at(t)
             except DeviceError as error:
                 self._error = error  # told by the next poll, as it was then
         return super().__getattr__(name)
@@ -240,10 +298,12 @@ class _SteeredSupply(_Steered):
             error, self._error = self._error, None
             raise error
         self._steering.polls(self._role, now)  # so that the turn is known
+        self._clock.begin_turn()
+        now = max(now, self._steering.turn_began)
         while (t := self._steering.supply_poll(now, holding=bool(self._samples))) is not None:
-            self._poll(t)
+            self.poll_at(t)
         if self._steering.ended:
-            self._poll(now)
+            self.poll_at(now)
         samples = []
         while self._samples and self._steering.sample_taken():
             self._steering.take_sample()
@@ -272,4 +332,5 @@ class SteeredBench(Bench):
 
     def decided(self, topic: str, fields: Mapping[str, Any]) -> None:
         """To be told of every row that the engine writes."""
-        self._steering.decided(topic, fields)
+        for role, t in self._steering.decided(topic, fields):
+            cast("_Steered", self.devices[role]).poll_at(t)

@@ -43,7 +43,11 @@ def served(scene, folder):
 @pytest.fixture(scope="module", params=["no-hv", "no-laser"])
 def real(request, tmp_path_factory):
     """A fixture's run in real time: one without high voltage, and one with a guard in a process of its own."""
-    return recorded(request.param, tmp_path_factory.mktemp("real"))
+    for _ in range(3):  # a machine that holds up the engine for longer than the guard bears ends a run, as it should
+        real = recorded(request.param, tmp_path_factory.mktemp("real"))
+        if real.log.outcome["status"] == "complete":
+            break
+    return real
 
 
 def recorded(name, folder):
@@ -69,14 +73,7 @@ def test_every_sample_comes_out_of_its_bytes_again(real):
     assert found.samples == {role: real.log.topics[f"/{role}/sample"] for role in found.samples}
 
 
-def test_the_run_asks_the_same_again_and_ends_the_same(real, request, tmp_path):
-    for k in range(2):
-        # A poll that moves no byte leaves no trace, nor does an engine's silence by which a guard has judged: on a busy
-        # machine the one decides which of two requests goes first, the other ends a run.
-        if rerun(real).exit_code == 0:
-            break
-        (tmp_path / f"{k}").mkdir()
-        real = recorded(request.node.callspec.params["real"], tmp_path / f"{k}")
+def test_the_run_asks_the_same_again_and_ends_the_same(real):
     assert real.log.outcome["status"] == "complete"
     found = rerun(real)
     assert found.exit_code == 0, found.report
