@@ -92,7 +92,7 @@ REJECTIONS = {
 }
 """Why a command was rejected, and what to do."""
 
-VELOCITY_UNIT = 1.6384  # velocity data per microstep/s
+VELOCITY_UNIT = 1.6384  # velocity data per microstep/s; acceleration data per 10 000 microsteps/s^2
 T = TypeVar("T")
 
 _MAX_LINE = 512  # devices send 80 characters a packet; settings raise that to some hundred
@@ -345,6 +345,7 @@ class ZaberStage:
         self._faults_told: set[str] = set()
         self._step = math.nan
         self._travel_steps = (0, 0)
+        self._acceleration = math.nan  # m/s^2
         self._raw = 0
         self._max_speed = self._max_speed_at_start = 0
         self._knob_locked = False
@@ -371,6 +372,10 @@ class ZaberStage:
     @property
     def referenced(self) -> bool:
         return self._referenced
+
+    def braking_distance(self, speed: float) -> float:
+        """How far it goes on (m) when it brakes from ``speed`` (m/s); NaN before set-up has ended."""
+        return 0.5 * speed**2 / self._acceleration if self._acceleration != 0 else 0.0  # 0: it knows no ramp
 
     def home(self) -> None:
         """Drive to the home sensor, which gives the stage its reference."""
@@ -491,6 +496,7 @@ class ZaberStage:
             )
         self._step = self._full_step / resolution
         self._travel_steps = (low, high)
+        self._acceleration = acceleration * 1e4 / VELOCITY_UNIT * self._step
         self._max_speed = self._max_speed_at_start = max_speed
         # What is only history is cleared now, so that it is not blamed on this run; what is still there is the state.
         yield from self._read_flags()

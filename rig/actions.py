@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.roles import DisplacementSample, ForceSample, HVFlag, Sample, StageSample
+from drivers.roles import DisplacementSample, ForceSample, HVFlag, Sample, Stage, StageSample
 from rig.calibrate.steps import CALIBRATION
 from rig.control import Question
 from rig.errors import FaultError, LimitError
@@ -34,6 +34,11 @@ CONTACT_WINDOW_S = 0.25  # force is averaged over this long before it is held ag
 CONTACT_SIGMAS = 4.0  # the threshold must exceed the noise of that average this many times
 HOMING_LIMIT_S = 90.0
 ARRIVAL_M = 50e-6  # a stage that says it is done must be this near to where it was sent
+# Towards contact the stage is sent in legs, so that it stops by itself when nobody renews them: never further ahead of
+# where it was measured than this and its braking distance. A new target replaces the one under way without a halt, and
+# comes so early that a lost command is noticed and given again (0.25 s) before the stage brakes.
+LEG_S, LEAST_LEG_M = 0.5, 0.1e-3
+RENEWED_WITH = 0.7  # of the leg left
 
 
 def carry_out(engine: Engine, action: Action) -> Turns:
@@ -126,6 +131,8 @@ def _mean(readings: list[float], role: str) -> tuple[float, float]:
 def _approach(engine: Engine, action: Action) -> Turns:
     """Advance until the averaged force exceeds the threshold; then work out where it began to rise.
 
+    The stage advances in legs: if this program dies or hangs, it stops by itself at most one `leg` further on.
+
     With a laser the contact position is where the laser says zero. Without, it is the corner of the line
     ``max(0, k (x - x0))`` through the forces met on the way, each at the stage's position at its own time.
     """
@@ -168,16 +175,25 @@ def _approach(engine: Engine, action: Action) -> Turns:
             met.append((sample.t, recorder.quantity_of(sample)))
 
     with listening(engine, listen):
-        engine.move_stage(goal, action.speed)
+        length = leg(stage, action.speed)
+        target, felt = min(start + length, goal), 0
+        engine.move_stage(target, action.speed)
         end = engine.clock.now() + _patience(action)
         while not (mean := _mean_of_last(met, n)) > threshold:
             if mean < -threshold:
                 raise FaultError(f"The force fell to {mean * 1e3:.1f} mN on the way to contact: its sign is wrong.")
-            if not stage.moving or engine.clock.now() > end:
+            stands = not stage.moving
+            if (stands and target == goal) or engine.clock.now() > end:
                 raise FaultError(
                     f"The film was not met within {action.parameters['max_travel'] * 1e3:g} mm of travel. "
                     "Is the specimen mounted, and the force sensor connected?"
                 )
+            if stands:  # the loop was late to renew the leg, or something stopped the stage
+                yield from _arrive(engine, target)
+            left = target - way[-1][1] if way else length
+            if target < goal and left < RENEWED_WITH * length and len(met) > felt:  # only on news of both
+                target, felt = min(way[-1][1] + length, goal), len(met)
+                engine.move_stage(target, action.speed)
             yield
         engine.stop_stage()
     yield from _wait(engine, lambda: not stage.moving, GRACE_S, "The stage's standstill")
@@ -190,7 +206,14 @@ def _approach(engine: Engine, action: Action) -> Turns:
         if recorder.contact <= where.min():
             raise FaultError("The force rose from the very beginning of the approach: contact was before it.")
     recorder.reference("contact_position", recorder.contact, error, "m")
-    yield from _go(engine, 0.0, action.speed, GRACE_S)
+    assert recorder.stage is not None
+    back = abs(recorder.stage.position - recorder.contact)
+    yield from _go(engine, 0.0, action.speed, back / action.speed * PATIENCE + GRACE_S)
+
+
+def leg(stage: Stage, speed: float) -> float:
+    """How far ahead of its measured position (m) the stage is sent towards contact at ``speed``."""
+    return max(speed * LEG_S, LEAST_LEG_M) + stage.braking_distance(speed)
 
 
 def _mean_of_last(met: list[tuple[float, float]], n: int) -> float:
@@ -256,9 +279,14 @@ def _go(engine: Engine, h: float, speed: float, limit: float) -> Turns:
     stage, recorder = engine.bench.stage, engine.recorder
     engine.move_to(h, speed)
     yield from _wait(engine, lambda: not stage.moving, limit, "The end of the stage's move")
+    yield from _arrive(engine, recorder.contact + h)
+
+
+def _arrive(engine: Engine, target: float) -> Turns:
+    """Make sure that a stage which says that it stands does so at ``target``, in metres of its own scale."""
     yield from pause(engine, 2 / engine.bench.scene.stage.poll_rate_Hz)
-    assert recorder.stage is not None
-    missed = recorder.stage.position - (recorder.contact + h)
+    assert engine.recorder.stage is not None
+    missed = engine.recorder.stage.position - target
     if not abs(missed) <= ARRIVAL_M:
         raise FaultError(
             f"stage: it stands {missed * 1e3:+.3f} mm from where it was sent, and says that it is done. "

@@ -305,6 +305,8 @@ def test_set_up_reads_everything_and_moves_nothing(bench: Bench) -> None:
     assert stage.ready
     assert stage.identity == roles.Identity("Zaber device 50081", "12345", "7.14")
     assert stage.travel == pytest.approx((0.0, 151.4976e-3), abs=1e-7)  # 151.50 mm in the data sheet
+    acceleration = 205 / 1.6384 * 1e4 * STEP  # 0.62 m/s^2
+    assert stage.braking_distance(10e-3) == pytest.approx((10e-3) ** 2 / (2 * acceleration), rel=1e-9)
     assert stage.settings["resolution"] == "64" and stage.settings["microstep_um"] == "0.49609375"
     assert stage.settings["warnings_at_start"] == "WR"
     assert stage.settings["knob"] == "locked" and bench.fake.settings["knob.enable"] == "0"

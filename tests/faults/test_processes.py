@@ -80,6 +80,43 @@ def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
     assert (abs(last) < 60.0).all()
 
 
+@pytest.fixture(scope="module")
+def slow_stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
+    """Where the last millimetre before the film takes two seconds, of 20 mm of travel allowed."""
+    with Stand(tmp_path_factory.mktemp("slow")) as stand:
+        fast = "speed_mm_per_s = 4.0\nthreshold_mN"
+        assert fast in stand.protocol.read_text()
+        stand.protocol.write_text(stand.protocol.read_text().replace(fast, "speed_mm_per_s = 0.5\nthreshold_mN"))
+        yield stand
+
+
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGSTOP, signal.SIGUSR1))],
+    ids=["killed", "stopped", "busy"],
+)
+def test_engine_gone_on_the_way_to_contact_leaves_the_stage_within_a_leg(
+    slow_stand: Stand, number: signal.Signals
+) -> None:
+    """Half a second at 0.5 mm/s, and the braking: 0.25 mm. One step of the stage is 0.5 um."""
+
+    def stage(t: float | None = None) -> tuple[float, float]:
+        """Its true position and velocity."""
+        return slow_stand.do(lambda bench: bench.world.stage.at(bench.now if t is None else t))
+
+    run = slow_stand.start()
+    slow_stand.wait(lambda: stage()[0] > 3.15e-3 and 0.4e-3 < stage()[1] < 0.6e-3, "the approach")
+    at = slow_stand.kill(run.engine, number)
+    slow_stand.wait(lambda: slow_stand.bench.clock.now() > at + 1.0, "a second")
+    (position, velocity), (last, still) = stage(at), stage()
+    assert velocity == pytest.approx(0.5e-3, rel=1e-3) and still == 0.0
+    assert 0.0 < last - position < 0.2515e-3
+    if number != signal.SIGKILL:
+        assert run.status is None  # it is still there
+        slow_stand.kill(run.engine)
+    slow_stand.wait_until_alone(run)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(840)
 def test_engine_killed_at_200_random_instants(tmp_path: Path) -> None:
