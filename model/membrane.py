@@ -153,14 +153,36 @@ class Solution:
         ------
         ValueError : the state has no answer
         """
-        kept = self.kept
         inputs = _Inputs.gather(self.specimen, self.h, self.voltage)
+        solved = self._solved(inputs)
+        return inputs.profile(np.zeros(1, dtype=np.intp), solved, dense(solved[1], points)).of(0)
+
+    def capacitance(self) -> float:
+        r"""Capacitance of the deformed film (F) between electrodes that cover it.
+
+        The film keeps its volume: where its area has grown by :math:`\lambda_1\lambda_2` it is thinner by as much, so
+        that
+
+        .. math:: C = \varepsilon \int \frac{dA}{t}
+                  = \frac{\varepsilon}{T \lambda_p^2} \int_a^b 2 \pi R (\lambda_1 \lambda_2)^2 dR
+
+        Raises
+        ------
+        ValueError : the state has no answer
+        """
+        problem, grid, state, _ = self._solved(_Inputs.gather(self.specimen, self.h, self.voltage))
+        film, at = self.specimen, ritz.evaluate(problem, grid, state)
+        area = 2.0 * math.pi * film.ring_radius**2 * float((grid.twice * np.exp(-2.0 * at.log[2])).sum())
+        return film.material.permittivity / (film.thickness * film.prestretch**2) * area
+
+    def _solved(self, inputs: _Inputs) -> Solved:
+        """The state itself, in arrays. Raises ValueError when it has no answer."""
         if self.quick is not None:
             problem = _Block(inputs, np.zeros(1, dtype=np.intp), self.evaluations).problem
-            kept = problem, *self.quick.arrays(), np.array([self.quick.lam])
-        if kept is None:
+            return problem, *self.quick.arrays(), np.array([self.quick.lam])
+        if self.kept is None:
             raise ValueError(f"no profile: {self.status.message}")
-        return inputs.profile(np.zeros(1, dtype=np.intp), kept, dense(kept[1], points)).of(0)
+        return self.kept
 
 
 @dataclass

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -234,9 +235,14 @@ def _bench(scene: Scene) -> str:
     return ON_PORTS if scene.on_real_ports else IN_MEMORY
 
 
+@cache
+def _version(package: str) -> str:
+    return metadata.version(package)
+
+
 def _this_origin() -> dict[str, dict[str, str]]:
     return {
-        "versions": {name: metadata.version(name) for name in RECORDED_PACKAGES},
+        "versions": {name: _version(name) for name in RECORDED_PACKAGES},
         "host": {
             "python": sys.version.split()[0],
             "system": platform.system(),

@@ -18,7 +18,7 @@ from model.specimen import Specimen
 from rig import protocol as steps
 from rig.errors import ConfigError, LimitError
 from rig.follow.steps import Follow
-from rig.safety.limits import Limits, capacitance
+from rig.safety.limits import Limits
 from rig.scene import Scene
 
 if TYPE_CHECKING:
@@ -291,7 +291,7 @@ def _stored_energy(specimen: Specimen, h: float, voltage: float, beside: float) 
     if voltage == 0.0:
         return 0.0
     state = solve(specimen, h, voltage)
-    return 0.5 * (capacitance(state) + beside) * voltage**2 if state.answered else math.nan
+    return 0.5 * (state.capacitance() + beside) * voltage**2 if state.answered else math.nan
 
 
 def check_plan(actions: list[Action], scene: Scene) -> list[Prediction]:

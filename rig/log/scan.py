@@ -14,7 +14,7 @@ import struct
 import zlib
 from array import array
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
@@ -33,6 +33,7 @@ MAX_MESSAGE = 1024 * 1024
 MAX_CHANNELS = 1000
 MAX_TABLES = 1000
 MAX_GAPS = 1000
+SHORT = 4096  # descriptions up to this many bytes, which every chunk repeats, are remembered
 # What the chunks of a file may expand to in all. Real logs expand to less than ten times their size, because the
 # message indexes are not compressed; a decompression bomb stops here.
 EXPANSION = (32 * 1024 * 1024, 32)
@@ -362,11 +363,12 @@ def _describe(
     described: set[int],
 ) -> None:
     """Take in a schema or a channel of a chunk."""
+    short = len(body) <= SHORT
     if opcode == Opcode.SCHEMA:
-        number, name, data = _schema(body)
+        number, name, data = _known_schema(body) if short else _schema(body)
         schemas[number] = name, data
     elif opcode == Opcode.CHANNEL:
-        number, schema_number, topic, encoding = _channel(body)
+        number, schema_number, topic, encoding = _known_channel(body) if short else _channel(body)
         if schema_number not in schemas:
             raise Damaged("a chunk with a channel without schema")
         channel = ChannelInfo(topic, encoding, *schemas[schema_number])
@@ -436,6 +438,10 @@ def _channel(body: bytes) -> tuple[int, int, str, str]:
         raise Damaged("a channel that ends too early") from None
     _table(body, at)
     return number, schema_number, topic, encoding
+
+
+_known_schema = lru_cache(maxsize=256)(_schema)
+_known_channel = lru_cache(maxsize=256)(_channel)
 
 
 def _table(body: bytes, at: int) -> dict[str, str]:

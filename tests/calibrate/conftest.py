@@ -30,7 +30,7 @@ speed_mm_per_s = 10.0
 {voltage}
 [stage]
 driver = "zaber"
-approach_from_mm = 36.0
+approach_from_mm = 10.0
 [force]
 driver = "gsv8"
 rate_Hz = 100.0
@@ -44,7 +44,7 @@ certificate = "{calibrations}/displacement.toml"
 HV = """
 [hv]
 driver = "iseg-edcp"
-ramp_V_per_s = 600.0
+ramp_V_per_s = 1200.0
 certificate = "{calibrations}/hv.toml"
 """
 STEPS = {
@@ -74,7 +74,7 @@ do = "mount"
 fixture = "target"
 [[step]]
 do = "visit"
-positions_mm = [36, 40.7, 44.6, 50]
+positions_mm = [10, 14.7, 18.6, 24]
 speed_mm_per_s = 10
 accuracy_um = 3.0
 cycles = 1
@@ -82,8 +82,8 @@ settle_s = 0.1
 average_s = 0.2
 [[step]]
 do = "glide"
-from_mm = 40
-to_mm = 46
+from_mm = 14
+to_mm = 18
 speeds_mm_per_s = [4, 10]
 """,
     "compliance": """
@@ -100,7 +100,7 @@ do = "press"
 force_N = 0.6
 speed_mm_per_s = 0.1
 settle_s = 0.1
-average_s = 0.5
+average_s = 0.2
 """,
     "hv": """
 [[step]]
@@ -135,7 +135,7 @@ def write_scene():
         path = folder / "scene.toml"
         path.write_text(
             parts.format(calibrations=(FIXTURES / "calibrations").as_posix(), voltage=voltage)
-            + f"[simulation]\n{truth}"
+            + f"[simulation]\ncontact_position_mm = 14.0\n{truth}"
         )
         return path
 

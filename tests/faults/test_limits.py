@@ -30,7 +30,7 @@ from rig.watch import FROZEN_FEWEST, Watch, check_zero
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 Tell = Callable[..., Any]  # of conftest.Story
-CONTACT_MM = 40.0
+CONTACT_MM = 17.0
 HEAD = """
 [[step]]
 do = "home"
@@ -130,7 +130,7 @@ def test_a_voltage_that_would_store_too_much_energy_is_refused(tell: Tell, old: 
         ),
         ("approach_from_mm = 36.0", "approach_from_mm = 160.0", "approach_from_mm, for this stage"),
         ("approach_from_mm = 36.0", "approach_from_mm = 1.0", "Clearance of the return step"),
-        ("[simulation.film]", "[simulation.stage]\ntravel_mm = 41.0\n[simulation.film]", "Largest displacement"),
+        ("[simulation.film]", "[simulation.stage]\ntravel_mm = 18.0\n[simulation.film]", "Largest displacement"),
     ],
 )
 def test_what_the_devices_cannot_do_is_refused_before_anything_moves(

@@ -35,7 +35,7 @@ from rig.safety import limits
 from rig.safety.arming import Arming
 from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
-from rig.safety.limits import FilmLimits, Limits, capacitance
+from rig.safety.limits import FilmLimits, Limits
 from rig.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.film import FilmTable
@@ -341,14 +341,15 @@ def film_at(h: float, volts: float) -> Solution:
 def quick_film(monkeypatch: pytest.MonkeyPatch) -> None:
     """The film at whole volts, from above, remembered: the model has tests of its own."""
     known: dict[int, float] = {}
+    worked_out = Solution.capacitance
 
     def capacitance_of(state: Solution) -> float:
         if id(state) not in known:  # `film_at` keeps the states alive
-            known[id(state)] = capacitance(state)
+            known[id(state)] = worked_out(state)
         return known[id(state)]
 
     monkeypatch.setattr(limits, "solve", lambda specimen, h, volts: film_at(h, float(math.ceil(volts))))
-    monkeypatch.setattr(limits, "capacitance", capacitance_of)
+    monkeypatch.setattr(Solution, "capacitance", capacitance_of)
 
 
 @pytest.mark.usefixtures("quick_film")

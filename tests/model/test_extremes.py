@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import warnings
 
@@ -87,8 +86,8 @@ def check(
 ) -> tuple[int, int]:
     """Statuses and numbers belong together, no warning, none wrong by more than ten estimates; answers, comparisons.
 
-    The reference is a hundred times slower than what it judges: ``compare`` has it judge that many states, drawn at
-    random, in place of all.
+    The reference is a hundred times slower than what it judges: ``compare`` has it judge that many of the answers,
+    drawn at random, in place of all.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -98,14 +97,13 @@ def check(
         assert np.array_equal(np.isfinite(getattr(found, name)), answered), name
     assert np.all(found.error_estimate[answered] <= 1e-6)
     assert np.all(found.min_meridional_stress[answered] > 0.0)
-    judged = np.arange(len(specimens))
+    judged = np.flatnonzero(answered)
     if compare is not None:
         judged = np.sort(np.random.default_rng(3).choice(judged, compare, replace=False))
     truth = reference([specimens[k] for k in judged], h[judged], voltage[judged], wrinkling=wrinkling)
-    both = answered[judged] & truth.converged
     wrong = np.abs(found.force[judged] / truth.force - 1.0) > 10.0 * found.error_estimate[judged]
-    assert not np.any(wrong & both), judged[wrong & both]
-    return int(answered.sum()), int(both.sum())
+    assert not np.any(wrong & truth.converged), judged[wrong & truth.converged]
+    return int(answered.sum()), int(truth.converged.sum())
 
 
 def grid(ratios: list[float], prestretches: list[float], heights: list[float], voltages: list[float]) -> tuple:
@@ -141,22 +139,17 @@ def test_nothing_goes_unsaid() -> None:
     assert compared > 0.5 * len(films)
 
 
-@functools.cache
-def wide_grid() -> tuple:
-    return grid(
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_nothing_goes_unsaid_on_five_thousand_states() -> None:
+    films, h, v = grid(
         [1e-5, 1e-3, 0.02, 0.3, 0.9],
         [1.0, 1.2, 2.0],
         [5e-8, 1e-3, 0.03, 0.3, 1.0, 3.0],
         [0, 0.5, 0.9, 1.0, 1.1, 1.5, 2, 3],
     )
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("wrinkling", ["plain", "tension_field"])
-def test_nothing_goes_unsaid_on_five_thousand_states(wrinkling: str) -> None:
-    films, h, v = wide_grid()
     assert len(films) >= 5000
-    answered, compared = check(films, h, v, wrinkling, compare=600)
-    assert answered > 0.4 * len(films)
-    assert compared > 0.3 * 600
+    for wrinkling in ("plain", "tension_field"):
+        answered, compared = check(films, h, v, wrinkling, compare=360)
+        assert answered > 0.4 * len(films)
+        assert compared > 0.8 * 360, wrinkling

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.energy import stored
 from model.materials import NAMED
 from model.membrane import profiles, solve
 from model.specimen import Specimen
@@ -63,3 +64,22 @@ def test_many_profiles_are_those_of_the_states(wrinkling):
             np.testing.assert_allclose(getattr(many, name)[k], drawn, rtol=3e-3, atol=1e-7, err_msg=name)
         share = {"plain": (0.0, 0.0, 0.0), "tension_field": (0.0, 0.52, 1.0)}[wrinkling][k]
         assert many.wrinkled[k].mean() == pytest.approx(share, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("h", "voltage", "wrinkling"),
+    [(5e-8, 10.0, "plain"), (8e-3, 1500.0, "plain"), (12e-3, 1900.0, "tension_field"), (0.0, 900.0, "plain")],
+)
+def test_capacitance_is_the_charge_by_the_voltage(h, voltage, wrinkling):
+    """The charge of `model.energy` is an integral over the drawn profile, and the energy's derivative."""
+    charge = stored(SPECIMEN, h, voltage, wrinkling).charge
+    assert solve(SPECIMEN, h, voltage, wrinkling=wrinkling).capacitance() == pytest.approx(charge / voltage, rel=1e-8)
+
+
+def test_capacitance_of_the_flat_film():
+    """A plate capacitor: the film is thinner by the pre-stretch squared."""
+    area, thickness = math.pi * (20e-3**2 - 4e-3**2), 40e-6 / 1.2**2
+    flat = 8.8541878128e-12 * SPECIMEN.material.eps_r * area / thickness
+    assert solve(SPECIMEN, 0.0, 500.0).capacitance() == pytest.approx(flat, rel=1e-9)
+    with pytest.raises(ValueError, match="no profile"):
+        solve(SPECIMEN, 1e-3, 50e3).capacitance()
