@@ -164,7 +164,7 @@ def kill_many(folder: Path, number: int, at_once: int, seed: int) -> Row:
     def work(k: int) -> None:
         rng = random.Random(seed * at_once + k)
         try:
-            with Stand(folder / f"stand-{k}", hold_s=1.5) as stand:
+            with Stand(folder / f"stand-{k}", hold_s=0.5) as stand:
                 duration = min(_undisturbed(stand) for _ in range(2))  # the first has more to read
                 for _ in range(k, number, at_once):
                     measure(stand, rows[k], rng.uniform(0.0, duration), rng)

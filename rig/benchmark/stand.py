@@ -54,7 +54,7 @@ voltage_V = 800
 settle_s = 0.1
 [[step]]
 do = "ramp"
-displacement_mm = 4.0
+displacement_mm = 2.0
 speed_mm_per_s = 4.0
 [[step]]
 do = "hold"
@@ -62,6 +62,7 @@ duration_s = HOLD_S
 [[step]]
 do = "return"
 speed_mm_per_s = 5.0
+clearance_mm = 0.5
 """
 
 

@@ -120,7 +120,7 @@ def test_engine_gone_on_the_way_to_contact_leaves_the_stage_within_a_leg(
 @pytest.mark.slow
 @pytest.mark.timeout(840)
 def test_engine_killed_at_200_random_instants(tmp_path: Path) -> None:
-    row = kill_many(tmp_path, 200, at_once=4, seed=1)
+    row = kill_many(tmp_path, 200, at_once=6, seed=1)
     assert len(row.ms) + row.without == 200
     assert len(row.ms) > 30  # so many had voltage on, or on its way
     assert row.never == 0

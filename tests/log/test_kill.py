@@ -19,8 +19,8 @@ import pytest
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 
-# Forks an engine and a writer for every case, ten cases at a time, and kills one of the two. The engine notes in
-# shared memory when it handed each sample over, the witness when it woke.
+# Forks an engine and a writer for every case, SIDE_BY_SIDE cases at a time, and kills one of the two. The engine notes
+# in shared memory when it handed each sample over, the witness when it woke.
 NURSERY = """
 import json, mmap, os, signal, socket, struct, sys, time
 from pathlib import Path
@@ -81,9 +81,11 @@ def wait(process):
     return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
 
 
+SIDE_BY_SIDE = 20
 folder, victim, delays = Path(sys.argv[1]), sys.argv[2], json.loads(sys.argv[3])
-for first in range(0, len(delays), 10):
-    batch = [(start(folder / f"{first + n}.mcap"), delay) for n, delay in enumerate(delays[first : first + 10])]
+for first in range(0, len(delays), SIDE_BY_SIDE):
+    some = delays[first : first + SIDE_BY_SIDE]
+    batch = [(start(folder / f"{first + n}.mcap"), delay) for n, delay in enumerate(some)]
     woken = mmap.mmap(-1, 8 * 100_000)
     watching = fork(witness, woken)
     began = time.monotonic()

@@ -21,7 +21,7 @@ from rig.log.recover import recover
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks processes up in /proc")]
 SOON_NS = 2 * 10**9  # the exact bounds are tested with an engine that keeps account
-PROTOCOL = Path(str(files("sim_fixtures"))) / "protocols" / "short.toml"
+SHORT = Path(str(files("sim_fixtures"))) / "protocols" / "short.toml"
 
 
 DEA_RIG = [sys.executable, "-m", "rig"]
@@ -32,11 +32,13 @@ TRIES = 3
 def under_voltage(folder):
     """A run that has come to 800 V, and its unfinished log; or, when the run gave up before, None and what it said."""
     folder.mkdir()
-    scene, ports, log = folder / "scene.toml", folder / "ports.json", folder / "run.mcap"
+    scene, protocol, ports, log = (folder / name for name in ("scene.toml", "short.toml", "ports.json", "run.mcap"))
     scene.write_text(scene_text())
+    assert "[0, 800]" in SHORT.read_text()
+    protocol.write_text(SHORT.read_text().replace("[0, 800]", "[800]"))
     bench = subprocess.Popen([*DEA_RIG, "sim", scene], stdout=subprocess.PIPE, text=True)
     ports.write_text(bench.stdout.readline())
-    arguments = ["run", scene, PROTOCOL, "-o", log, "--ports", ports, "--arm", "--yes"]
+    arguments = ["run", scene, protocol, "-o", log, "--ports", ports, "--arm", "--yes"]
     run = subprocess.Popen([*DEA_RIG, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         said = []

@@ -57,6 +57,16 @@ def ports(scene: Path, tmp_path: Path) -> Iterator[Path]:
             assert bench.wait(10) == 0
 
 
+@pytest.fixture
+def live_soon(tmp_path: Path) -> Path:
+    """The short protocol without its sweep at 0 V."""
+    text = (FIXTURES / "protocols/short.toml").read_text()
+    assert "[0, 800]" in text
+    path = tmp_path / "live_soon.toml"
+    path.write_text(text.replace("[0, 800]", "[800]"))
+    return path
+
+
 def dea_rig(*arguments: str | Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "rig", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -92,11 +102,13 @@ def test_without_arm_there_is_no_high_voltage_and_no_log(scene: Path, ports: Pat
         *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)),
     ],
 )
-def test_a_signal_ends_a_run_safely(scene: Path, ports: Path, tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_ends_a_run_safely(
+    scene: Path, live_soon: Path, ports: Path, tmp_path: Path, number: signal.Signals
+) -> None:
     from rig.log.reader import read_log
 
     log = tmp_path / "run.mcap"
-    run = dea_rig("run", scene, FIXTURES / "protocols/short.toml", "-o", log, "--ports", ports, "--arm", "--yes")
+    run = dea_rig("run", scene, live_soon, "-o", log, "--ports", ports, "--arm", "--yes")
     assert run.stderr is not None
     for line in run.stderr:
         if "800 V" in line and "sweep: 0 to" in line:
@@ -112,18 +124,13 @@ def test_a_signal_ends_a_run_safely(scene: Path, ports: Path, tmp_path: Path, nu
 
 @pytest.mark.slow
 def test_a_run_is_paused_continued_and_stopped_from_another_terminal(
-    scene: Path, ports: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Path, live_soon: Path, ports: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from rig.log.reader import read_log
 
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     log, slow = tmp_path / "run.mcap", tmp_path / "slow.toml"
-    slow.write_text(
-        (FIXTURES / "protocols/short.toml")
-        .read_text()
-        .replace("= 6.0\nspeed_mm_per_s = 4.0", "= 6.0\nspeed_mm_per_s = 1.0")
-        .replace("[0, 800]", "[800]")
-    )
+    slow.write_text(live_soon.read_text().replace("= 6.0\nspeed_mm_per_s = 4.0", "= 6.0\nspeed_mm_per_s = 1.0"))
     with dea_rig("run", scene, slow, "-o", log, "--ports", ports, "--arm") as run:
         try:
             assert run.stderr is not None
