@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import pytest
@@ -38,6 +39,12 @@ speed_mm_per_s = {SPEED * 1e3}
 threshold_mN = 8.0
 max_travel_mm = 8.0
 """
+
+
+@pytest.fixture
+def tell(tell: Tell) -> Tell:
+    """With the scenes' own way to the film."""
+    return partial(tell, nearer=False)
 
 
 @dataclass
