@@ -97,10 +97,10 @@ do = "mount"
 fixture = "dummy"
 [[step]]
 do = "press"
-force_N = 0.6
+force_N = 0.5
 speed_mm_per_s = 0.1
-settle_s = 0.1
-average_s = 0.2
+settle_s = 0.05
+average_s = 0.15
 """,
     "hv": """
 [[step]]

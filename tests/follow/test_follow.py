@@ -89,14 +89,15 @@ def test_what_a_fit_does_not_know_is_told(short, tmp_path):
     path.write_text(json.dumps(fit))
     (found,) = strokes(short, path)
     rng = np.random.default_rng(3)
+    specimen = load_scene_of_fixture()[0].specimen.specimen()
     drawn = []
     for _ in range(60):
         values = {name: value * (1 + relative[name] * rng.standard_normal()) for name, value in true.items()}
         for name, value in values.items():
             fit["quantities"][name]["value"] = value
         path.write_text(json.dumps(fit))
-        film = read_fit(path, load_scene_of_fixture()[0].specimen.specimen().material).material
-        actuator = Actuator(load_scene_of_fixture()[0].specimen.specimen().with_material(film), Mass(0.25))
+        film = read_fit(path, specimen.material).material
+        actuator = Actuator(specimen.with_material(film), Mass(0.25))
         rest = rest_from(actuator, 0.0, 0.0, 20e-3)
         drawn.append(rest_from(actuator, rest, found.voltage, 20e-3) - rest)
     assert found.expected_stroke_uncertainty == pytest.approx(np.std(drawn, ddof=1), rel=0.3)
