@@ -2,7 +2,8 @@
 
 How often an instrument is asked for its value between two commands is then left to chance. So a request is answered by
 its like in the log: a question that the log repeats all the time by that which was asked nearest to the same time since
-the last command. Everything else, commands above all, must come as it came then, in the same order.
+the last command. Everything else, commands above all, must come as it came then, in the same order. Only motions, which
+follow from readings, are given some play: their places by a few steps, and one replaced at once may be missing.
 """
 
 from __future__ import annotations
@@ -14,10 +15,14 @@ from collections.abc import Callable
 from typing import NamedTuple, NoReturn
 
 REPEATED = 20  # a request that stands so often in a log is a question that is asked all the time
+NEAR_STEPS = 20  # of the stage, about 10 um: by which the place of a motion may differ
+AT_ONCE_S = 0.05  # a motion replaced so soon may as well not have begun: it is left to chance which reading came first
 ANSWER_S = 0.5  # what comes later after a request comes by itself
 
 _ZABER = re.compile(rb"/(\d+ \d+) (\d+) ?([^:\n]*)(?::[0-9A-F]{2})?\r?\n")
 _ZABER_REPLY = re.compile(rb"@(\d+ \d+) (\d+)([^:\r\n]*)(:[0-9A-F]{2})?\r\n")
+_ZABER_MOTION = re.compile(rb"(\d+ \d+ move abs) (-?\d+)")
+_ZABER_HALT = re.compile(rb"\d+ \d+ (?:stop|move abs -?\d+)")
 _GSV8_HEAD = 3  # prefix, kind with the number of data bytes, command; then data and suffix
 
 
@@ -52,6 +57,14 @@ class Dialect:
         """What two requests have in common that ask the same."""
         return request
 
+    def alike(self, then: bytes, now: bytes) -> bool:
+        """Whether a command with the key ``now`` is that which had the key ``then``."""
+        return then == now
+
+    def replaces(self, earlier: bytes, later: bytes) -> bool:
+        """Whether a command with the key ``later`` takes the place of one with the key ``earlier``."""
+        return False
+
     def anew(self, exchange: Exchange, request: bytes) -> tuple[tuple[float, bytes], ...]:
         """The answers of ``exchange``, given to ``request``."""
         return exchange.answers
@@ -63,6 +76,15 @@ class _Zaber(Dialect):
     def key(self, request: bytes) -> bytes:
         match = _ZABER.fullmatch(request)
         return request if match is None else match[1] + b" " + match[3]
+
+    def alike(self, then: bytes, now: bytes) -> bool:
+        one, other = _ZABER_MOTION.fullmatch(then), _ZABER_MOTION.fullmatch(now)
+        if one is None or other is None:
+            return then == now
+        return one[1] == other[1] and abs(int(one[2]) - int(other[2])) <= NEAR_STEPS
+
+    def replaces(self, earlier: bytes, later: bytes) -> bool:
+        return _ZABER_MOTION.fullmatch(earlier) is not None and _ZABER_HALT.fullmatch(later) is not None
 
     def anew(self, exchange: Exchange, request: bytes) -> tuple[tuple[float, bytes], ...]:
         then, now = _ZABER.fullmatch(exchange.request.data), _ZABER.fullmatch(request)
@@ -185,13 +207,20 @@ class ServedScript:
         """The next exchange that cannot be left out, if it is this one; time goes on from there."""
         for n in range(self._next, len(self._exchanges)):
             exchange = self._exchanges[n]
-            if exchange.key == key:
+            if self._dialect.alike(exchange.key, key):
                 self._next = n + 1
                 self._lag.s = t - exchange.request.t
                 return exchange
-            if exchange.key not in self._repeated:
+            if exchange.key not in self._repeated and not self._replaced_at_once(n):
                 break
         return None
+
+    def _replaced_at_once(self, n: int) -> bool:
+        now = self._exchanges[n]
+        later = next((one for one in self._exchanges[n + 1 :] if one.key not in self._repeated), None)
+        if later is None or later.request.t - now.request.t > AT_ONCE_S:
+            return False
+        return self._dialect.replaces(now.key, later.key)
 
     def _nearest(self, key: bytes, t: float) -> Exchange | None:
         """Of the exchanges up to the next that cannot be left out, and the newest, that which is nearest in time."""

@@ -60,9 +60,30 @@ def test_after_a_command_time_goes_on_from_there():
 
 def test_another_command_is_refused():
     one = script(zaber(POSITIONS, "move abs 5"))
-    with pytest.raises(Departed, match="move abs 6"):
-        one.write(encode(1, 1, 3, "move abs 6"), 3.0)
+    with pytest.raises(Departed, match="move abs 26"):
+        one.write(encode(1, 1, 3, "move abs 26"), 3.0)
+    with pytest.raises(Departed, match="move vel 5"):
+        one.write(encode(1, 1, 4, "move vel 5"), 3.0)
     assert b"move abs 5" in one.due.data
+
+
+def test_a_motion_to_nearly_the_same_place_is_the_same():
+    """Where contact is follows from a mean over readings, and which readings those are is left to chance."""
+    one = script(zaber(POSITIONS, "move abs 12092"))
+    ask(one, 3.0, 3, "move abs 12095")
+    assert ask(one, 3.1, 4, "get pos") == 7777
+
+
+@pytest.mark.parametrize(("later", "missed"), [(0.004, True), (0.1, False)])
+def test_a_motion_may_be_missing_that_was_stopped_at_once(later, missed):
+    rows = zaber(POSITIONS, "move abs 5")[:-3]
+    t = rows[-1][0] + later
+    one = script([*rows, (t, True, encode(1, 1, 90, "stop")), (t + 0.01, False, b"@01 1 90 OK BUSY -- 0\r\n")])
+    if missed:
+        assert ask(one, 3.0, 7, "stop") == 0
+    else:
+        with pytest.raises(Departed, match="stop"):
+            one.write(encode(1, 1, 7, "stop"), 3.0)
 
 
 def test_a_command_may_come_before_its_time_but_not_twice():
