@@ -34,7 +34,7 @@ CHANGES = {
     "ramp_V_per_s = 300.0": "ramp_V_per_s = 1200.0",
     '[displacement]\ndriver = "keyence-lkg"\ncertificate = "../calibrations/displacement.toml"\n': "",
     "[simulation.displacement]\ngain_error = -3e-4\n": "",
-    "contact_position_mm = 40.0\nrig_compliance_um_per_N = 2.0": "contact_position_mm = 4.0",
+    "contact_position_mm = 40.0\nrig_compliance_um_per_N = 2.0": "contact_position_mm = 5.0",
     "[simulation.film]": "[simulation.stage]\nstart_position_mm = 0.5\n\n[simulation.film]",
 }
 PROTOCOL = """

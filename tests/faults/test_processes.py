@@ -82,7 +82,7 @@ def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
 
 @pytest.fixture(scope="module")
 def slow_stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
-    """Where the last millimetre before the film takes two seconds, of 20 mm of travel allowed."""
+    """Where the last two millimetres before the film take four seconds, of 20 mm of travel allowed."""
     with Stand(tmp_path_factory.mktemp("slow")) as stand:
         fast = "speed_mm_per_s = 4.0\nthreshold_mN"
         assert fast in stand.protocol.read_text()
