@@ -392,9 +392,7 @@ def _assemble(
     misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
     rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits]
     doubts = suspects(problem, x, determined(problem, fit.at_bound, held))
-    guilty = doubts[0] if doubts and doubts[0].significant else None
-    bias = None if guilty is None else guilty.amplitude * guilty.shape
-    stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals, suspect=bias)
+    stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals, doubts=doubts)
     quantities = stated.quantities
     if profiles or fit.at_bound[: problem.terms].any():  # where a term has vanished, curvature says nothing of it
         aims = targets(problem, stated.stretch, held)
@@ -421,6 +419,7 @@ def _assemble(
         lack_of_fit_freedom=misfit_freedom,
         lack_of_fit_probability=probability,
         suspects=doubts,
+        unseen=stated.unseen,
         noise_ratio=math.sqrt(problem.noise_variance),
         samples_per_independent=problem.correlation_time,
         parameters=stated.parameters,

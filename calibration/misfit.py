@@ -4,12 +4,17 @@ The overall chi-square spreads its attention over all shapes that a misfit can h
 hides in it although it biases the result. So the residuals are also held against the shape of each usual suspect: with
 ``d`` the change of the weighted residuals by one unit of it, and ``P`` the projection off everything that the fitted
 parameters can do, its amplitude is ``a = -d P r / |P d|^2`` with standard uncertainty ``1/|P d|`` (a score test).
+
+What the parameters can do for themselves no test finds (Neyman & Pearson 1933): an imperfection that looks much like
+another stiffness or permittivity biases them before it shows. So each suspect also tells from which size on it would
+be reported, and what it does to the result until then.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +27,12 @@ Array = NDArray[np.float64]
 SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
 RELAXATION_S = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 INSTANTS = 2000  # of a run's time, at which a viscous force is worked out
+ALMOST_SURE = 1.6449  # standard deviations that 95 of 100 stay below
 VISIBLE = 1e-3  # share of a shape that the parameters must leave over; less is round-off and interpolation
+
+
+# Factor and unit in which an amplitude is shown.
+SHOWN = {"1": (100.0, "%"), "m/N": (1e6, "um/N")}
 
 
 @dataclass(frozen=True)
@@ -30,7 +40,8 @@ class Suspect:
     """An imperfection that the residuals were held against.
 
     ``amplitude`` with its standard ``uncertainty`` is its size in ``unit``; ``probability`` of as much by chance
-    counts that several suspects were looked at. ``shape`` is what one unit of it does to the weighted residuals.
+    counts that several suspects were looked at. From the size ``shows_from`` on, 95 of 100 experiments like this one
+    would report it. ``shape`` is what one unit of it does to the weighted residuals.
     """
 
     name: str
@@ -38,6 +49,7 @@ class Suspect:
     uncertainty: float
     unit: str
     probability: float
+    shows_from: float
     shape: Array
 
     @property
@@ -48,8 +60,14 @@ class Suspect:
     @property
     def words(self) -> str:
         """For the operator, with the size in the unit of the bench."""
-        factor, unit = {"1": (100.0, "%"), "m/N": (1e6, "um/N")}[self.unit]
+        factor, unit = SHOWN[self.unit]
         return f"{self.name} ({self.amplitude * factor:+.2g} {unit}, +- {self.uncertainty * factor:.1g})"
+
+    @property
+    def blind(self) -> str:
+        """For the operator: up to what size it may be there unseen."""
+        factor, unit = SHOWN[self.unit]
+        return f"{self.name} (up to {self.shows_from * factor:.2g} {unit})"
 
 
 def suspects(problem: Problem, x: Array, free: NDArray[np.bool_]) -> list[Suspect]:
@@ -63,8 +81,17 @@ def suspects(problem: Problem, x: Array, free: NDArray[np.bool_]) -> list[Suspec
         size = float(np.linalg.norm(visible))
         if size > VISIBLE * float(np.linalg.norm(shape)) and size > 0.0:
             found.append((name, unit, shape, -float(visible @ residual) / size**2, 1.0 / size))
+    reported = NormalDist().inv_cdf(1.0 - 0.5 * SIGNIFICANT / max(1, len(found)))
     judged = [
-        Suspect(name, a, u, unit, min(1.0, len(found) * math.erfc(abs(a) / u / math.sqrt(2.0))), shape)
+        Suspect(
+            name=name,
+            amplitude=a,
+            uncertainty=u,
+            unit=unit,
+            probability=min(1.0, len(found) * math.erfc(abs(a) / u / math.sqrt(2.0))),
+            shows_from=(reported + ALMOST_SURE) * u,
+            shape=shape,
+        )
         for name, unit, shape, a, u in found
     ]
     return sorted(judged, key=lambda one: one.probability)
@@ -82,7 +109,7 @@ def _shapes(problem: Problem, x: Array) -> list[tuple[str, str, Array]]:
 
     shapes = []
     if all(curve.time is not None for curve in curves):
-        for tau, shape in zip(RELAXATION_S, _viscous(problem, x), strict=True):
+        for tau, shape in _viscous(problem, x).items():
             shapes.append((f"viscous film with a relaxation time near {tau:g} s", "1", shape))
     elif 1 in problem.ways and -1 in problem.ways:
         ways = np.concatenate(
@@ -110,13 +137,15 @@ def _shapes(problem: Problem, x: Array) -> list[tuple[str, str, Array]]:
     return shapes
 
 
-def _viscous(problem: Problem, x: Array) -> Array:
-    """What Maxwell branches as stiff as the film itself do to the weighted residuals, a row for each of `RELAXATION_S`.
+def _viscous(problem: Problem, x: Array) -> dict[float, Array]:
+    """What Maxwell branches as stiff as the film itself do to the weighted residuals, by their relaxation time (s).
 
     The force of one is ``integral of exp(-(t - s)/tau) dF0`` over the history of its run, with the force ``F0`` at 0 V.
+    Branches slower than any run are left out: they are stiffness to it.
     """
     rest = problem.at_rest(x)
     found = np.zeros((len(RELAXATION_S), problem.data_rows + len(problem.nuisances)))
+    longest = 0.0
     places = np.cumsum([0, *(root.shape[0] for root in problem.roots)])
     runs = [problem.curves[problem.active[row]].run for row in problem.block_rows]
     for run in dict.fromkeys(runs):
@@ -127,16 +156,17 @@ def _viscous(problem: Problem, x: Array) -> Array:
             curve = problem.curves[problem.active[row]]
             assert curve.time is not None
             times.append(curve.time[block.rows])
-            elastic.append(interpolation_matrix(problem.nodes[row], curve.h[block.rows]) @ rest[row])
+            elastic.append(interpolation_matrix(problem.nodes[row], curve.place[block.rows]) @ rest[row])
         time, force = np.concatenate(times), np.concatenate(elastic)
         order = np.argsort(time, kind="stable")
         grid = np.linspace(time.min(), time.max(), INSTANTS)
+        longest = max(longest, float(grid[-1] - grid[0]))
         extra = _maxwell(grid[1] - grid[0], np.interp(grid, time[order], force[order]))
         for k, at in zip(mine, times, strict=True):
             block = problem.blocks[k]
             samples = np.array([np.interp(at, grid, one) for one in extra])
             found[:, places[k] : places[k + 1]] = samples / block.sigma @ block.base / math.sqrt(problem.inflation)
-    return found
+    return {tau: rows for tau, rows in zip(RELAXATION_S, found, strict=True) if tau <= longest}
 
 
 def _maxwell(step: float, elastic: Array) -> Array:

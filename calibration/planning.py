@@ -49,9 +49,10 @@ class Places:
     def __init__(
         self, specimen: Specimen, h: Array, voltage: Array, rate: float, errors: Curve, stretch: tuple[float, float]
     ) -> None:
-        """``errors`` states noise and zeros; ``stretch`` is where the stiffness is wanted."""
+        """``errors`` states noise, zeros and compliance; ``stretch`` is where the stiffness is wanted."""
         material = specimen.material
-        slopes = solve_many(specimen, h, voltage, sensitivities=True).dforce
+        solved = solve_many(specimen, h, voltage, sensitivities=True)
+        slopes = solved.dforce
         assert slopes is not None
         mu, alpha = np.array(material.mu), np.array(material.alpha)
         n, charged = mu.size, bool((voltage != 0.0).any())
@@ -60,7 +61,11 @@ class Places:
         if charged:
             columns.append(slopes["eps_r"][:, None] * material.eps_r)
             prior.append(IGNORANCE)
-        for slope, size in ((np.ones(h.size), errors.force_zero), (slopes["h"], errors.displacement_zero)):
+        for slope, size in (
+            (np.ones(h.size), errors.force_zero),
+            (slopes["h"], errors.displacement_zero),
+            (slopes["h"] * solved.force, errors.compliance_uncertainty),
+        ):
             if size > 0.0:
                 columns.append(slope[:, None])
                 prior.append(size)

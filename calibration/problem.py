@@ -251,7 +251,7 @@ class Problem:
         """Of the used samples of a row: residual (measured minus model, N), its deviation, displacement."""
         i, part = self.parts[row]
         curve, used = self.curves[i], part.used
-        matrix = interpolation_matrix(self.nodes[row], curve.h[used])
+        matrix = interpolation_matrix(self.nodes[row], curve.place[used])
         model = matrix @ states.force[row]
         for value, nuisance in zip(x[self.film_parameters :], self.nuisances, strict=True):
             if nuisance.kind == "force_zero" and row in nuisance.rows:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.curve import Curve
+from calibration.misfit import Suspect
 from calibration.problem import Problem
 from calibration.result import Quantity, Stiffness, Zero, verdict
 from model.materials import Material
@@ -103,7 +104,7 @@ class Propagation:
     """Standard uncertainties of functions of the film's parameters, part by part.
 
     ``misfit`` is the chi-square of the lack of fit over its expectation; ``rivals`` are other minima with their
-    likelihood relative to this one; ``suspect`` is the change of the residuals by an imperfection that was found.
+    likelihood relative to this one; ``doubts`` are imperfections, of which the first biases the result if it is there.
     """
 
     def __init__(
@@ -113,13 +114,17 @@ class Propagation:
         free: NDArray[np.bool_],
         misfit: float,
         rivals: Sequence[tuple[Material, float]],
-        suspect: Array | None,
+        doubts: Sequence[Suspect],
     ) -> None:
         self.problem = problem
         self.film = problem.film(x)
         self.covariance = Covariance(problem.jacobian(x), free)
         self.misfit = misfit
-        self.bias = None if suspect is None else self.covariance.response @ suspect
+        self.doubts = doubts
+        self.bias: Array | None = None
+        for guilty in doubts[:1]:
+            if guilty.significant:
+                self.bias = self.covariance.response @ (guilty.amplitude * guilty.shape)
         self.rivals = rivals
         self.effects: dict[str, Array] = {}
         states = problem.states(x)
@@ -155,6 +160,15 @@ class Propagation:
         total = math.hypot(*budget.values()) if known else math.inf
         relative = total / abs(value) if value else math.inf
         return Quantity(value, total, unit, budget, verdict(relative, at_bound), at_bound)
+
+    def unseen(self, gradients: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+        """By how much each imperfection may shift functions of x before it would be reported."""
+        # The shape is what it would do to the model; the data have it and the model has not.
+        shifts = {one.name: self.covariance.response @ (-one.shows_from * one.shape) for one in self.doubts}
+        return {
+            doubt: {name: float(gradient @ shift) for name, gradient in gradients.items()}
+            for doubt, shift in shifts.items()
+        }
 
     def covariances(self, gradients: Array) -> Array:
         """Covariance matrix of functions of x with these gradients, by all parts that propagate linearly."""
@@ -202,6 +216,7 @@ class Statement:
     correlation: list[list[float]]
     covariance: list[list[float]]
     condition: float
+    unseen: dict[str, dict[str, float]]  # shift of stiffness and permittivity by each suspect that does not show yet
 
 
 def state(
@@ -212,17 +227,17 @@ def state(
     *,
     misfit: float = 1.0,
     rivals: Sequence[tuple[Material, float]] = (),
-    suspect: Array | None = None,
+    doubts: Sequence[Suspect] = (),
 ) -> Statement:
     """Quantities with uncertainties at ``x``; ``at_bound`` marks entries of x, ``held`` names those that were given.
 
-    ``suspect`` is what an imperfection that was found (`calibration.misfit`) does to the weighted residuals; what it
-    does to the results is part of their uncertainty.
+    ``doubts`` are the imperfections that the residuals were held against (`calibration.misfit`), most probable first.
+    If that one was found, what it does to the results is part of their uncertainty.
     """
     n = problem.terms
     vanished = at_bound[:n]
     free = determined(problem, at_bound, held)
-    propagation = Propagation(problem, x, free, misfit, rivals, suspect)
+    propagation = Propagation(problem, x, free, misfit, rivals, doubts)
     film = propagation.film
     mu, alpha = np.array(film.mu), np.array(film.alpha)
     zero, unit = np.zeros(n), np.eye(n)
@@ -267,6 +282,8 @@ def state(
             lambda m: m.eps_r, slopes["eps_r"], "1", at_bound=bool(at_bound[2 * n])
         )
 
+    told = {"stiffness": gradient(by_mu[at], by_alpha[at]), **({"eps_r": slopes["eps_r"]} if "eps_r" in slopes else {})}
+
     if vanished.any():  # what is left is another model: its terms are not those that were asked for
         lost = [name for name in quantities if name.startswith(("mu", "alpha"))]
         quantities |= {name: replace(quantities[name], verdict=verdict(math.inf, True)) for name in lost}
@@ -296,6 +313,7 @@ def state(
         correlation=_correlation(np.array(list(slopes.values())), propagation.covariance.matrix),
         covariance=propagation.covariances(np.array(list(slopes.values()))).tolist(),
         condition=_condition(problem, x, free),
+        unseen=propagation.unseen(told),
     )
 
 

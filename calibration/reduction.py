@@ -1,8 +1,8 @@
 """From samples to as few numbers as carry the same information about the model.
 
 A curve of the model is smooth in the displacement, so its values ``f`` at a few Chebyshev nodes give it everywhere:
-``F(h_i) = sum_j B_ij f_j`` with the barycentric matrix ``B``. With ``W = diag(1/sigma_i)`` and the thin factorisation
-``W B = Q R`` the misfit of any ``f`` to n samples is
+``F(h_i) = sum_j B_ij f_j`` with the barycentric matrix ``B``. With ``W = diag(1/sigma_i)`` and a factorisation
+``W B = Q R`` of as many columns as its rank the misfit of any ``f`` to n samples is
 
     chi2(f) = |R f - Q^T W y|^2 + (|W y|^2 - |Q^T W y|^2)
 
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 GRID = 33  # states at which the loss of tension is looked for along a curve
 CONTACT_MARGIN = 3.0  # standard uncertainties of the displacement zero
+RANK = 1e-9  # singular values of a reduced curve, relative to the largest, that carry anything but round-off
 VOLTAGE_MARGIN = 0.1  # of the nominal voltage; farther off, the output was ramping or had tripped
 
 
@@ -101,7 +102,7 @@ def select(curves: Sequence[Curve], material: Material, wrinkling: Wrinkling = "
     grids = np.zeros((len(rows), GRID))
     voltage = np.zeros((len(rows), 1))
     for row, i in enumerate(rows):
-        h = curves[i].h[given[i][0]]
+        h = curves[i].place[given[i][0]]
         grids[row] = np.linspace(h.min(), max(h.max(), h.min() + 1e-9), GRID)
         voltage[row] = reference_voltage(curves[i], given[i][0])
     films = np.empty((len(rows), 1), dtype=np.object_)
@@ -129,7 +130,7 @@ def _given(curve: Curve) -> tuple[NDArray[np.bool_], dict[str, int]]:
         (~curve.usable, "without a value"),
         (off & (curve.nominal_voltage != 0.0), "away from the nominal voltage"),
         # Closer than this to the zero the tip may not touch the film yet, and a free tip pulls with no force.
-        (curve.h < CONTACT_MARGIN * curve.displacement_zero, "before contact"),
+        (curve.place < CONTACT_MARGIN * curve.displacement_zero, "before contact"),
     ):
         _count(excluded, reason, used & which)
         used &= ~which
@@ -145,15 +146,15 @@ def _divide(
     wrinkling: Wrinkling,
 ) -> Selection:
     """Cut the samples ``given`` of a curve into parts, by the status of the film on a grid of displacements."""
-    place = np.rint((curve.h[given] - grid[0]) / (grid[-1] - grid[0]) * (GRID - 1)).astype(np.intp)
+    place = np.rint((curve.place[given] - grid[0]) / (grid[-1] - grid[0]) * (GRID - 1)).astype(np.intp)
     state = np.full(curve.h.size, -1)
     state[given] = status[place]
     wrinkled = int((state == Status.WRINKLED).sum())
     described = status == Status.TAUT
     if wrinkling == "tension_field":
         described |= status == Status.WRINKLED
-    first, last = _longest(described, curve.h[given], grid)
-    inside = given & (curve.h >= first) & (curve.h <= last)
+    first, last = _longest(described, curve.place[given], grid)
+    inside = given & (curve.place >= first) & (curve.place <= last)
     for value in np.unique(state[given & ~inside]):
         if value == Status.TAUT or (value == Status.WRINKLED and wrinkling == "tension_field"):
             reason = "next to a state that is not taut"
@@ -167,10 +168,10 @@ def _divide(
         cuts = [first, *middle, last]
     parts = []
     for low, high in itertools.pairwise(cuts):
-        used = inside & (curve.h >= low) & ((curve.h < high) if high < last else (curve.h <= high))
+        used = inside & (curve.place >= low) & ((curve.place < high) if high < last else (curve.place <= high))
         if used.any():
-            least = float(curve.h[used].min())
-            parts.append(Part(used, least, max(float(curve.h[used].max()), least + 1e-9)))
+            least = float(curve.place[used].min())
+            parts.append(Part(used, least, max(float(curve.place[used].max()), least + 1e-9)))
     return Selection(tuple(parts), excluded, curve.h.size, wrinkled)
 
 
@@ -246,7 +247,7 @@ def reduce(curve: Curve, used: NDArray[np.bool_], nodes: Array, voltage: float, 
         rows = np.flatnonzero(used & (curve.direction == direction))
         if rows.size == 0:
             continue
-        matrix = interpolation_matrix(nodes, curve.h[rows])
+        matrix = interpolation_matrix(nodes, curve.place[rows])
         force = curve.force[rows]
         if voltage > 0.0:
             by_square = at.by_voltage / (2 * voltage)
@@ -255,6 +256,9 @@ def reduce(curve: Curve, used: NDArray[np.bool_], nodes: Array, voltage: float, 
         matrix /= sigma[:, None]
         force = force / sigma
         base, root = np.linalg.qr(matrix)
+        turn, size, root = np.linalg.svd(root)
+        told = size > RANK * size[0]  # a film held at two places tells two forces, however many nodes there are
+        base, root = base @ turn[:, : size.size][:, told], size[told, None] * root[: size.size][told]
         target = base.T @ force
         noise = force - base @ target
         blocks.append(

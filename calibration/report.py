@@ -15,6 +15,7 @@ from typing import Any
 from calibration import figures
 from calibration.curve import Curve
 from calibration.identify import secant_modulus
+from calibration.misfit import SHOWN, Suspect
 from calibration.reduction import select
 from calibration.result import CONVENTION, IDENTIFIED, WEAKLY_IDENTIFIED, Identification, Quantity
 from calibration.rounding import percent, rounded
@@ -113,6 +114,10 @@ def _render(
         least_bic=min((other.bic for other in comparison), default=0.0),
         convention=CONVENTION,
         thresholds=(f"{IDENTIFIED:.0%}", f"{WEAKLY_IDENTIFIED:.0%}"),
+        shifted_names=[
+            name for name in ("stiffness", "eps_r") if name in next(iter(identification.unseen.values()), {})
+        ],
+        unseen=[_unseen(identification, suspect) for suspect in identification.suspects],
         specimens=list(dict.fromkeys(curve.specimen.name or "unnamed" for curve in curves)),
         noise=" or ".join(f"{noise:.3g}" for noise in sorted({1e3 * curve.force_noise for curve in curves})),
         force_displacement=_data_uri(figures.force_displacement(identification, curves, selections)),
@@ -164,6 +169,23 @@ def _row(name: str, quantity: Quantity, known: Mapping[str, float]) -> _Row:
         if known_here and math.isfinite(quantity.uncertainty)
         else "",
     )
+
+
+def _unseen(identification: Identification, suspect: Suspect) -> dict[str, Any]:
+    """A suspect as a row of the table of what could be there unseen."""
+    factor, unit = SHOWN[suspect.unit]
+    amplitude, uncertainty = rounded(suspect.amplitude * factor, suspect.uncertainty * factor)
+    shifts = []
+    for name, shift in identification.unseen[suspect.name].items():
+        quantity = identification.quantities[name]
+        text = f"{100.0 * shift / quantity.value:+.2g} %"
+        shifts.append({"text": text, "harmful": abs(shift) > quantity.uncertainty})
+    return {
+        "name": suspect.name,
+        "found": f"{amplitude} ± {uncertainty} {unit}",
+        "shows_from": f"{suspect.shows_from * factor:.2g} {unit}",
+        "shifts": shifts,
+    }
 
 
 def _truth(identification: Identification, truth: Material | None) -> dict[str, float]:

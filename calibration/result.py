@@ -121,6 +121,8 @@ class Identification:
         Misfit that smooth curves would not have, in the noise found, and the probability of as much by chance.
     suspects : list of Suspect
         Known imperfections whose shape the residuals were held against, most probable first.
+    unseen : dict of str to dict of str to float
+        By how much each of them shifts ``stiffness`` and ``eps_r`` at the size from which on it would be reported.
     noise_ratio : float
         Scatter about the nearest smooth curves over the stated standard deviation.
     samples_per_independent : float
@@ -152,6 +154,7 @@ class Identification:
     lack_of_fit_freedom: int
     lack_of_fit_probability: float
     suspects: list[Suspect]
+    unseen: dict[str, dict[str, float]]
     noise_ratio: float
     samples_per_independent: float
     parameters: list[str]
@@ -188,6 +191,20 @@ class Identification:
     def excluded(self) -> int:
         """Samples left out."""
         return sum(curve.samples - curve.used for curve in self.curves)
+
+    @property
+    def blind_spots(self) -> list[Suspect]:
+        """Suspects that may shift stiffness or permittivity by more than their uncertainty before they show.
+
+        The most harmful first.
+        """
+
+        def harm(suspect: Suspect) -> float:
+            return max(
+                abs(shift) / self.quantities[name].uncertainty for name, shift in self.unseen[suspect.name].items()
+            )
+
+        return sorted((one for one in self.suspects if harm(one) > 1.0), key=harm, reverse=True)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dictionaries; a number that is not finite becomes None."""
@@ -228,6 +245,8 @@ class Identification:
                         "standard_uncertainty": one.uncertainty,
                         "unit": one.unit,
                         "probability": one.probability,
+                        "shows_from": one.shows_from,
+                        "shift_unseen": self.unseen[one.name],
                     }
                     for one in self.suspects
                 ],

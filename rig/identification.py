@@ -23,8 +23,10 @@ from rig.log.dataset import CurveErrors, Run, load_run
 from rig.scene import Scene
 from rig.toml_file import parse_table
 
-# A sample belongs to its curve while the measured voltage is this near to the nominal one.
+# Of a rig that nobody pressed on (m/N): load cells for a newton give way by some 0.3 mm at full scale.
+UNKNOWN_COMPLIANCE = 3e-4
 NOISE_SIGMAS = 5.0  # by this much of its noise a sensor may read beyond its calibrated range
+# A sample belongs to its curve while the measured voltage is this near to the nominal one.
 VOLTAGE_V, VOLTAGE_PART = 50.0, 0.05
 
 
@@ -106,8 +108,7 @@ def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certi
     stage = certificates.get("stage")
     if run.has_laser or stage is None:
         return curve
-    h = curve.h - stage.compliance * curve.force
-    return replace(curve, h=h, compliance_uncertainty=stage.compliance_uncertainty)
+    return replace(curve, h=curve.h - stage.compliance * curve.force)
 
 
 def _in_calibrated_range(curve: Curve, certificates: Mapping[str, Certificate]) -> Curve:
@@ -126,7 +127,9 @@ def _in_calibrated_range(curve: Curve, certificates: Mapping[str, Certificate]) 
 
 def _at_its_voltage(curve: Curve) -> Curve:
     """The curve with those samples flagged at which the measured voltage was not the nominal one."""
-    allowed = max(VOLTAGE_V, VOLTAGE_PART * abs(curve.nominal_voltage))
+    allowed = max(  # A sample belongs to its curve while the measured voltage is this near to the nominal one.
+        VOLTAGE_V, VOLTAGE_PART * abs(curve.nominal_voltage)
+    )
     elsewhere = ~(np.abs(curve.voltage - curve.nominal_voltage) <= allowed) & np.isfinite(curve.voltage)
     return replace(curve, flagged=elsewhere if curve.flagged is None else curve.flagged | elsewhere)
 
@@ -137,6 +140,12 @@ def _notes(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         log = run.log
         notes += [f"{log.path}: {problem}" for problem in _certificate_problems(run)]
+        if not run.has_laser and "stage" not in run.certificates:
+            notes.append(
+                f"{log.path}: the stage's way stands for the disk's, and nobody knows by how much the rig gives way; "
+                f"it is fitted along (within {1e6 * UNKNOWN_COMPLIANCE:.0f} um/N), which makes the results less certain. "
+                "`dea-rig calibrate compliance` tells"
+            )
         if not log.whole:
             notes.append(f"{log.path} is cut short or damaged; `dea-rig info {log.path}` tells what is missing")
         status = (log.outcome or {}).get("status", "unknown")
@@ -242,11 +251,15 @@ def errors_of(scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErr
         thickness_uncertainty=dimensions.thickness_uncertainty_um / dimensions.thickness_um,
         prestretch_uncertainty=dimensions.prestretch_uncertainty / dimensions.prestretch,
         disk_radius_uncertainty=dimensions.disk_radius_uncertainty_mm / dimensions.disk_radius_mm,
+        eccentricity=dimensions.eccentricity_mm * 1e-3,
     )
     laser, hv = certificates.get("displacement"), certificates.get("hv")
     if laser is not None:
         errors["displacement_noise"] = laser.noise
         errors["displacement_gain"] = laser.gain_uncertainty
+    else:
+        stage = certificates.get("stage")
+        errors["compliance_uncertainty"] = UNKNOWN_COMPLIANCE if stage is None else stage.compliance_uncertainty
     if hv is not None:
         errors["voltage_gain"] = hv.gain_uncertainty
     return errors

@@ -70,11 +70,14 @@ class SpecimenTable(Table):
     disk_radius_uncertainty_mm: NotNegative = 0.0
     thickness_uncertainty_um: NotNegative = 0.0
     prestretch_uncertainty: NotNegative = 0.0
+    eccentricity_mm: NotNegative = 0.0  # how far the disk may sit off the ring's centre
 
     @model_validator(mode="after")
     def _sensible(self) -> Self:
         if not self.disk_radius_mm < self.ring_radius_mm:
             raise ValueError("disk_radius_mm must be smaller than ring_radius_mm")
+        if not self.eccentricity_mm < self.ring_radius_mm - self.disk_radius_mm:
+            raise ValueError("eccentricity_mm must be smaller than the gap between disk and ring")
         if isinstance(self.material, str) and self.material not in NAMED:
             raise ValueError(f"material {self.material!r} is not known; known are {', '.join(sorted(NAMED))}")
         return self

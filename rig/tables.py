@@ -196,6 +196,19 @@ def identification_table(found: Identification) -> Group:
     ]
     lines += [f"note: {warning}" for warning in found.warnings]
     lines += [f"advice: {advice}" for advice in found.advice]
+    if found.blind_spots:
+        from calibration.rounding import percent
+
+        worst = found.blind_spots[0]
+        shifts = (
+            f"{_NAMES.get(name, name)} by {percent(abs(shift / found.quantities[name].value))}"
+            for name, shift in found.unseen[worst.name].items()
+        )
+        lines.append(
+            f"unseen: {len(found.blind_spots)} imperfections could be there without showing in these data and shift "
+            f"a result by more than its uncertainty, most of all: {worst.blind}, {', '.join(shifts)}. The report "
+            "lists them."
+        )
     return Group(*lines)
 
 

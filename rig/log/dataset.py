@@ -63,6 +63,8 @@ class CurveErrors(TypedDict, total=False):
     thickness_uncertainty: float
     prestretch_uncertainty: float
     disk_radius_uncertainty: float
+    compliance_uncertainty: float
+    eccentricity: float
 
 
 @dataclass(frozen=True, eq=False)

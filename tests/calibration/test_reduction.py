@@ -75,6 +75,51 @@ def test_reduction_preserves_chi_square_exactly() -> None:
         assert reduced == pytest.approx(direct, rel=1e-10)
 
 
+def held(places: tuple[float, ...], samples: int, noise: float, seed: int) -> Curve:
+    """A film held at some displacements, which the sensor reads with noise."""
+    random = np.random.default_rng(seed)
+    h = np.repeat(places, samples)
+    curve = plain_curve(
+        h + noise * random.standard_normal(h.size),
+        np.repeat(solve_many(SPECIMEN, list(places), 0.0).force, samples) + 5e-3 * random.standard_normal(h.size),
+    )
+    # Between two places the film moves: one sample each that is not held.
+    direction = np.where(np.arange(h.size) % samples == 0, 1, 0)
+    return replace(curve, direction=direction, displacement_noise=noise)
+
+
+def test_while_the_disk_is_held_the_mean_of_the_readings_is_its_place() -> None:
+    curve = held((3e-3, 8e-3, 10e-3), 400, 5e-6, 1)
+    for k, place in enumerate((3e-3, 8e-3, 10e-3)):
+        rows = slice(400 * k + 1, 400 * (k + 1))
+        assert np.ptp(curve.place[rows]) == 0.0
+        assert curve.place[400 * k + 1] == pytest.approx(place, abs=4 * 5e-6 / np.sqrt(399))
+    assert (curve.place[::400] == curve.h[::400]).all()
+    moving = replace(curve, direction=np.zeros(curve.h.size, dtype=int))  # called a hold, but it is none
+    assert (moving.place == moving.h).all()
+    lost = curve.h.copy()
+    lost[5] = np.nan
+    assert np.isnan(replace(curve, h=lost).place[5])
+    assert np.isfinite(replace(curve, h=lost).place[6])
+
+
+def test_noise_of_the_displacement_of_a_held_film_is_no_misfit() -> None:
+    """Reading a held disk with noise makes no film seem wrong: chi-square of the truth is its degrees of freedom."""
+    places = (3e-3, 8e-3, 10e-3)
+    nodes = chebyshev_nodes(3e-3, 10e-3, NODES)
+    at = solve_many(SPECIMEN, nodes, 0.0, sensitivities=True)
+    assert at.dforce is not None
+    model = NodeModel(at.force, at.dforce["h"], at.dforce["voltage"])
+    misfit, freedom = 0.0, 0
+    for seed in range(40):
+        curve = held(places, 400, 5e-5, seed)
+        (block,) = [one for one in reduce(curve, curve.usable, nodes, 0.0, model) if one.way == 0]
+        assert block.root.shape == (len(places), NODES)  # three places tell three forces
+        misfit += float(((block.root @ at.force - block.target) ** 2).sum())
+        freedom += len(places)
+    assert abs(misfit - freedom) < 3.0 * np.sqrt(2.0 * freedom)
+
+
 def test_samples_are_carried_to_one_voltage() -> None:
     """A supply that drifts by 2 % leaves no more misfit than one that does not."""
     h = np.linspace(0.5e-3, 12e-3, 400)

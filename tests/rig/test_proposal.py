@@ -128,12 +128,17 @@ def experiment(protocol: Protocol, seed: int) -> list[Curve]:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_in_half_the_time_it_does_tell_as_much(half: proposal.Proposal, whole: proposal.Proposal) -> None:
-    """Scatter about the truth over 48 simulated experiments each; two such scatters differ by chance by 15 %."""
+    """Scatter about the truth over 100 simulated experiments each is what is stated, and no worse than the sweep's.
+
+    Such a scatter is known to 7 %, the ratio of two to 10 %.
+    """
     scatter, stated = {}, {}
+    alarms = 0
     for label, protocol in (("planned", half.planned.protocol), ("sweep", whole.sweep.protocol)):
         errors, uncertainties = [], []
-        for seed in range(48):
+        for seed in range(100):
             found = identify(experiment(protocol, seed), terms=1, starts=1)
+            alarms += any("the model does not explain the data" in words for words in found.warnings)
             stiffness = found.quantities["stiffness"]
             known = secant_modulus(ONE_TERM, *found.stretch)
             eps_r = found.quantities["eps_r"]
@@ -144,9 +149,11 @@ def test_in_half_the_time_it_does_tell_as_much(half: proposal.Proposal, whole: p
             )
         scatter[label] = np.sqrt(np.mean(np.square(errors), axis=0))
         stated[label] = np.median(uncertainties, axis=0)
-    assert (scatter["planned"] < 1.35 * scatter["sweep"]).all(), scatter
+    assert (scatter["planned"] < 1.2 * scatter["sweep"]).all(), scatter
     assert (stated["planned"] <= stated["sweep"]).all(), stated
-    assert (scatter["planned"] < 1.5 * stated["planned"]).all(), (scatter, stated)
+    for label, found in scatter.items():
+        assert (np.abs(found / stated[label] - 1.0) < 0.2).all(), (scatter, stated)
+    assert alarms <= 6, "a right model is called wrong"
 
 
 @pytest.mark.slow
