@@ -142,7 +142,7 @@ def _notes(runs: Sequence[Run]) -> list[str]:
         notes += [f"{log.path}: {problem}" for problem in _certificate_problems(run)]
         if not run.has_laser and "stage" not in run.certificates:
             notes.append(
-                f"{log.path}: the stage's way stands for the disk's, and by how much the rig gives way is not known; it "
+                f"{log.path}: the stage's way stands for the disk's, and how far the rig gives way is not known; it "
                 f"is fitted along (within {1e6 * UNKNOWN_COMPLIANCE:.0f} um/N), which makes the results less certain. "
                 "`dea-rig calibrate compliance` tells"
             )
