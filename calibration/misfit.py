@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from calibration.problem import Problem
 from calibration.reduction import interpolation_matrix
+from calibration.rounding import two_digits
 
 Array = NDArray[np.float64]
 
@@ -61,13 +62,15 @@ class Suspect:
     def words(self) -> str:
         """For the operator, with the size in the unit of the bench."""
         factor, unit = SHOWN[self.unit]
-        return f"{self.name} ({self.amplitude * factor:+.2g} {unit}, +- {self.uncertainty * factor:.1g})"
+        sign = "-" if self.amplitude < 0.0 else "+"
+        size, uncertainty = (two_digits(one * factor) for one in (abs(self.amplitude), self.uncertainty))
+        return f"{self.name} ({sign}{size} {unit}, +- {uncertainty})"
 
     @property
     def blind(self) -> str:
         """For the operator: up to what size it may be there unseen."""
         factor, unit = SHOWN[self.unit]
-        return f"{self.name} (up to {self.shows_from * factor:.2g} {unit})"
+        return f"{self.name} (up to {two_digits(self.shows_from * factor)} {unit})"
 
 
 def suspects(problem: Problem, x: Array, free: NDArray[np.bool_]) -> list[Suspect]:

@@ -18,7 +18,7 @@ from calibration.identify import secant_modulus
 from calibration.misfit import SHOWN, Suspect
 from calibration.reduction import select
 from calibration.result import CONVENTION, IDENTIFIED, WEAKLY_IDENTIFIED, Identification, Quantity
-from calibration.rounding import percent, rounded
+from calibration.rounding import percent, rounded, two_digits
 from model.materials import Material
 
 
@@ -183,7 +183,7 @@ def _unseen(identification: Identification, suspect: Suspect) -> dict[str, Any]:
     return {
         "name": suspect.name,
         "found": f"{amplitude} ± {uncertainty} {unit}",
-        "shows_from": f"{suspect.shows_from * factor:.2g} {unit}",
+        "shows_from": f"{two_digits(suspect.shows_from * factor)} {unit}",
         "shifts": shifts,
     }
 

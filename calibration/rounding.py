@@ -13,6 +13,11 @@ def rounded(value: float, uncertainty: float) -> tuple[str, str]:
     return f"{value:.{digits}f}", f"{uncertainty:.{digits}f}"
 
 
+def two_digits(value: float) -> str:
+    """A number as text, to two significant digits, without a power of ten where people write none."""
+    return f"{float(f'{value:.1e}'):g}"
+
+
 def percent(fraction: float) -> str:
     """A relative uncertainty as text, to two significant digits."""
     if not math.isfinite(fraction) or fraction > 10.0:
