@@ -211,7 +211,7 @@ def fits(report: Fits, path: Path) -> None:
             x, y = [1e3 * point.seconds for point in mine], [max(point.error[name], 1e-12) for point in mine]
             axes.plot(x, y, color=colour, marker=marker, label=method)
             for point, at, error in zip(mine, x, y, strict=True):
-                if point.tolerance in (1e-3, 1e-5, 1e-7):
+                if point.tolerance in (1e-3, 1e-5):
                     label = f"{point.tolerance:.0e}"
                     axes.annotate(label, (at, error), xytext=(5, 4), textcoords="offset points", fontsize=8)
         axes.set(xscale="log", yscale="log", title=title, xlabel="time of a fit / ms", ylim=(1e-9, 1e-3))
