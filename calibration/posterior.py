@@ -1,6 +1,7 @@
 r"""The posterior of a fit by Markov chains, where least squares with a covariance may not be believed.
 
-The walkers of emcee (Foreman-Mackey et al. 2013, affine-invariant stretch moves) sample
+The walkers of emcee (Foreman-Mackey et al. 2013; stretch moves and, as often, differential evolution, which forgets
+twice as fast in the long valleys of Ogden terms) sample
 
 .. math:: \ln p(x) = -\tfrac{1}{2} \chi^2(x) + \text{const}
 
@@ -11,7 +12,7 @@ Gains and the specimen's dimensions are not sampled: what they add stands in the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +28,8 @@ from calibration.result import Identification
 Array = NDArray[np.float64]
 
 WALKERS = 4  # a parameter
-STEPS = 3000
+MOST_STEPS = 12_000
+LOOK = 500  # steps after which it is looked whether the chain is long enough
 ENOUGH = 50.0  # autocorrelation times that a chain must be long before its times can be believed (emcee's own advice)
 KEPT = 2000  # samples at which derived quantities are worked out
 
@@ -87,8 +89,25 @@ class Posterior:
         }
 
 
-def posterior(curves: Sequence[Curve], found: Identification, *, steps: int = STEPS, seed: int = 0) -> Posterior:
-    """Sample the posterior around an identification of ``curves``.
+def posterior(
+    curves: Sequence[Curve],
+    found: Identification,
+    *,
+    steps: int = MOST_STEPS,
+    seed: int = 0,
+    progress: Callable[[float, float, str], None] = lambda done, total, label: None,
+) -> Posterior:
+    """Sample the posterior around an identification of ``curves``, until the chain is long enough.
+
+    Parameters
+    ----------
+    curves, found
+        What was fitted, and what came of it.
+    steps : int
+        At most so many; a chain that is too short by then says so.
+    seed : int
+    progress : callable
+        Told steps done, steps expected, and a label.
 
     Raises
     ------
@@ -118,20 +137,25 @@ def posterior(curves: Sequence[Curve], found: Identification, *, steps: int = ST
         return values
 
     begin = _around(problem, best, low, high, walkers, rng)
-    sampler = emcee.EnsembleSampler(walkers, best.size, log_probability, vectorize=True)
+    moves = [(emcee.moves.DEMove(), 0.5), (emcee.moves.StretchMove(), 0.5)]
+    sampler = emcee.EnsembleSampler(walkers, best.size, log_probability, moves=moves, vectorize=True)
     sampler.random_state = np.random.RandomState(seed).get_state()
-    sampler.run_mcmc(begin, steps)
-    times = np.asarray(sampler.get_autocorr_time(tol=0, quiet=True))[: problem.film_parameters]
-    longest = float(times.max()) if np.isfinite(times).all() else math.inf
-    chain = sampler.get_chain(discard=steps // 3, flat=True)
+    state, done, longest = begin, 0, math.inf
+    while done < min(steps, ENOUGH * longest):
+        state = sampler.run_mcmc(state, min(LOOK, steps - done))
+        done = sampler.iteration
+        times = np.asarray(sampler.get_autocorr_time(tol=0, quiet=True))[: problem.film_parameters]
+        longest = float(times.max()) if np.isfinite(times).all() else math.inf
+        progress(done, max(done, min(steps, ENOUGH * longest)), f"{done} steps, autocorrelation {longest:.0f}")
+    chain = sampler.get_chain(discard=done // 3, flat=True)
     kept = chain[rng.choice(len(chain), size=min(KEPT, len(chain)), replace=False)]
     return Posterior(
         quantities=_quantities(problem, kept, found),
-        steps=steps,
+        steps=done,
         walkers=walkers,
         acceptance=float(np.mean(sampler.acceptance_fraction)),
         autocorrelation=longest,
-        converged=steps >= ENOUGH * longest,
+        converged=done >= ENOUGH * longest,
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -278,12 +279,20 @@ def fit(
     """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties."""
     from rig.identification import identify_logs, write_results
     from rig.outputs import check_new
+    from rig.progress import progress
     from rig.tables import comparison_table, identification_table, posterior_table, show
 
     check_new(out, report)
-    found = identify_logs(
-        list(logs), terms=terms, comparing=comparing, profiles=profiles, wrinkled=wrinkled, posterior=posterior
-    )
+    with progress("Markov chains around the fit") if posterior else nullcontext(lambda *_: None) as update:
+        found = identify_logs(
+            list(logs),
+            terms=terms,
+            comparing=comparing,
+            profiles=profiles,
+            wrinkled=wrinkled,
+            posterior=posterior,
+            progress=update,
+        )
     write_results(found, out, report)
     tables = [comparison_table(found.comparison)] if comparing else []
     tables += [posterior_table(found.identification)] if posterior else []

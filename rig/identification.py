@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -54,12 +54,13 @@ def identify_logs(
     profiles: bool = False,
     wrinkled: str = "left-out",
     posterior: bool = False,
+    progress: Callable[[float, float, str], None] = lambda done, total, label: None,
 ) -> Found:
     """Identify the film from all recorded curves of all logs at once.
 
     ``comparing`` judges 1, 2 and 3 Ogden terms beside each other, ``profiles`` adds 95 % intervals from profile
-    likelihood, ``posterior`` Markov chains; each takes a few seconds more. ``wrinkled`` is "left-out" or
-    "tension-field".
+    likelihood; each takes a few seconds more. ``posterior`` adds Markov chains, which take a minute or more and tell
+    ``progress``. ``wrinkled`` is "left-out" or "tension-field".
 
     Raises
     ------
@@ -97,7 +98,7 @@ def identify_logs(
         if posterior:
             from calibration.posterior import posterior as sample
 
-            identification = replace(identification, posterior=sample(curves, identification))
+            identification = replace(identification, posterior=sample(curves, identification, progress=progress))
     except (CurveError, IdentificationError, CertificateError) as error:
         raise DataError(f"{error}.") from None
     return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs), comparison)

@@ -14,8 +14,10 @@ from calibration.posterior import posterior
 def test_one_term_has_the_posterior_that_its_covariance_says(experiment):
     curves = experiment(1, samples=200, disks=(4e-3,), voltages=(0.0, 1500.0))
     found = identify(curves, terms=1)
-    chains = posterior(curves, found, steps=4500)
-    assert chains.converged
+    told: list[tuple[float, float, str]] = []
+    chains = posterior(curves, found, progress=lambda *what: told.append(what))
+    assert chains.converged and chains.steps >= 50 * chains.autocorrelation
+    assert told[-1][:2] == (chains.steps, chains.steps)
     assert 0.2 < chains.acceptance < 0.8
     for name in ("eps_r", "stiffness", "alpha1"):
         quantity, sampled = found.quantities[name], chains.quantities[name]
