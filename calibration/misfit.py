@@ -32,6 +32,20 @@ ALMOST_SURE = 1.6449  # standard deviations that 95 of 100 stay below
 VISIBLE = 1e-3  # share of a shape that the parameters must leave over; less is round-off and interpolation
 
 
+COMPLIANCE = "compliance of the rig that is not taken off"
+SOFTENING = "film that softens from one curve to the next"
+NOT_SQUARE = "electric force that does not go with V^2"
+HYSTERESIS = "hysteresis: loading above unloading"
+# How each is ruled out or found, by the beginning of its name.
+REMEDIES = {
+    "viscous film": "hold the film displaced, in the same run, for several times as long",
+    COMPLIANCE: "`dea-rig calibrate compliance`",
+    SOFTENING: "measure the curve at the first voltage once more at the end",
+    NOT_SQUARE: "`dea-rig calibrate hv`; compare fits of single voltages",
+    HYSTERESIS: "give the curves with their times, and one more at another speed",
+    "thickness": "measure the thickness of every specimen",
+}
+
 # Factor and unit in which an amplitude is shown.
 SHOWN = {"1": (100.0, "%"), "m/N": (1e6, "um/N")}
 
@@ -42,7 +56,8 @@ class Suspect:
 
     ``amplitude`` with its standard ``uncertainty`` is its size in ``unit``; ``probability`` of as much by chance
     counts that several suspects were looked at. From the size ``shows_from`` on, 95 of 100 experiments like this one
-    would report it. ``shape`` is what one unit of it does to the weighted residuals.
+    would report it. ``remedy`` tells how to rule it out, or to find it. ``shape`` is what one unit of it does to the
+    weighted residuals.
     """
 
     name: str
@@ -51,6 +66,7 @@ class Suspect:
     unit: str
     probability: float
     shows_from: float
+    remedy: str
     shape: Array
 
     @property
@@ -93,6 +109,7 @@ def suspects(problem: Problem, x: Array, free: NDArray[np.bool_]) -> list[Suspec
             unit=unit,
             probability=min(1.0, len(found) * math.erfc(abs(a) / u / math.sqrt(2.0))),
             shows_from=(reported + ALMOST_SURE) * u,
+            remedy=next(words for beginning, words in REMEDIES.items() if name.startswith(beginning)),
             shape=shape,
         )
         for name, unit, shape, a, u in found
@@ -120,13 +137,13 @@ def _shapes(problem: Problem, x: Array) -> list[tuple[str, str, Array]]:
         )
         loop = plain(force)
         loop[: ways.size] *= ways
-        shapes.append(("hysteresis: loading above unloading", "1", loop))
+        shapes.append((HYSTERESIS, "1", loop))
     if not any(nuisance.kind == "compliance" for nuisance in problem.nuisances):
-        shapes.append(("compliance of the rig that is not taken off", "m/N", plain(-force * by["h"])))
+        shapes.append((COMPLIANCE, "m/N", plain(-force * by["h"])))
     if len(set(problem.active)) > 1:
         first = {curve.run: i for i, curve in reversed(list(zip(problem.active, curves, strict=True)))}
         order = np.array([[float(i - first[curve.run])] for i, curve in zip(problem.active, curves, strict=True)])
-        shapes.append(("film that softens from one curve to the next", "1", plain(-force * order)))
+        shapes.append((SOFTENING, "1", plain(-force * order)))
     films = list(dict.fromkeys(curve.specimen.with_material(problem.material) for curve in curves))
     for film in films[1:]:
         here = np.array([[curve.specimen.with_material(problem.material) == film] for curve in curves])
@@ -136,7 +153,7 @@ def _shapes(problem: Problem, x: Array) -> list[tuple[str, str, Array]]:
     if len(set(np.rint(voltages[voltages > 0.0]))) > 1:
         weight = ((voltages / voltages.max()) ** 2)[:, None]
         eps_r = problem.film(x).eps_r
-        shapes.append(("electric force that does not go with V^2", "1", plain(by["eps_r"] * eps_r * weight)))
+        shapes.append((NOT_SQUARE, "1", plain(by["eps_r"] * eps_r * weight)))
     return shapes
 
 

@@ -185,6 +185,7 @@ def _unseen(identification: Identification, suspect: Suspect) -> dict[str, Any]:
         "found": f"{amplitude} ± {uncertainty} {unit}",
         "shows_from": f"{two_digits(suspect.shows_from * factor)} {unit}",
         "shifts": shifts,
+        "remedy": suspect.remedy.replace("`", ""),
     }
 
 

@@ -247,6 +247,7 @@ class Identification:
                         "probability": one.probability,
                         "shows_from": one.shows_from,
                         "shift_unseen": self.unseen[one.name],
+                        "remedy": one.remedy,
                     }
                     for one in self.suspects
                 ],

@@ -206,8 +206,8 @@ def identification_table(found: Identification) -> Group:
         )
         lines.append(
             f"unseen: {len(found.blind_spots)} imperfections could be there without showing in these data and shift "
-            f"a result by more than its uncertainty, most of all: {worst.blind}, {', '.join(shifts)}. The report "
-            "lists them."
+            f"a result by more than its uncertainty, most of all: {worst.blind}, {', '.join(shifts)}. To rule it "
+            f"out: {worst.remedy}. The report lists them all."
         )
     return Group(*lines)
 

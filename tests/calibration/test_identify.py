@@ -236,6 +236,36 @@ def test_hysteresis_is_reported_as_lack_of_fit(experiment: Experiment) -> None:
         assert curve.mean_residual_loading > curve.mean_residual_unloading
 
 
+def test_what_is_advised_against_unseen_imperfections_rules_them_out(experiment: Experiment) -> None:
+    """The first curve once more at the end tells softening from a permittivity; a hold tells a viscous film."""
+    options: dict[str, Any] = {"samples": 200, "disks": (4e-3,), "truth": ONE_TERM, "guess": ONE_TERM}
+    curves = experiment(1, voltages=(0.0, 1000.0, 1500.0, 0.0), **options)
+    once_more = curves[3]
+    assert once_more.time is not None
+    top = once_more.h.max()
+    force = float(solve_many(once_more.specimen.with_material(ONE_TERM), np.array([top]), 0.0).force[0])
+    held = replace(
+        once_more,
+        h=np.concatenate((once_more.h[:50], np.full(150, top))),
+        force=np.concatenate((once_more.force[:50], force + 5e-3 * np.random.default_rng(3).normal(size=150))),
+        time=once_more.time[0] + np.concatenate((np.linspace(0.0, 6.0, 50), np.linspace(6.0, 126.0, 150))),
+        direction=np.ones(200, dtype=np.int8),
+    )
+
+    def shifts(measured: list[Curve], name: str) -> dict[str, float]:
+        found = identify(measured, terms=1, starts=1)
+        return {doubt: abs(by[name]) / found.quantities[name].value for doubt, by in found.unseen.items()}
+
+    softening, viscous = "film that softens from one curve to the next", "viscous film with a relaxation time near 30 s"
+    plain = identify(curves[:3], terms=1, starts=1)
+    remedies = {one.name: one.remedy for one in plain.suspects}
+    assert remedies[softening] == "measure the curve at the first voltage once more at the end"
+    assert shifts(curves[:3], "eps_r")[softening] > 10.0 * plain.quantities["eps_r"].relative
+    assert shifts(curves, "eps_r")[softening] < 0.5 * plain.quantities["eps_r"].relative
+    assert remedies[viscous] == "hold the film displaced, in the same run, for several times as long"
+    assert shifts([*curves[:3], held], "stiffness")[viscous] < 0.5 * shifts(curves, "stiffness")[viscous]
+
+
 def test_a_wrong_disk_radius_is_reported_as_lack_of_fit(experiment: Experiment) -> None:
     curves = experiment(seed=2, guess=ONE_TERM, errors={}, noise=2e-3)
     wrong = [replace(c, specimen=replace(c.specimen, disk_radius=1.05 * c.specimen.disk_radius)) for c in curves[:3]]
