@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ UNCERTAINTIES = (
     "disk_radius_uncertainty",
     "compliance_uncertainty",
     "eccentricity",
+    "lag_uncertainty",
 )
 
 
@@ -72,6 +74,9 @@ class Curve:
         compliance that is believed; 0 where a sensor on the disk measures ``h``. One rig: the same in all curves.
     eccentricity : float
         Standard uncertainty of the distance of the disk's centre from the ring's (m).
+    lag_uncertainty : float
+        Standard uncertainty (s) of how much later than the displacement the force was taken; the same error in all
+        curves of a run. It bears on curves with ``time``.
     time : ndarray, shape (n,), optional
         When each sample was taken, on the clock of its run (s). With it a viscous film can be told from other errors.
     flagged : ndarray of bool, shape (n,), optional
@@ -98,6 +103,7 @@ class Curve:
     disk_radius_uncertainty: float = 0.0
     compliance_uncertainty: float = 0.0
     eccentricity: float = 0.0
+    lag_uncertainty: float = 0.0
     time: Array | None = None
     flagged: NDArray[np.bool_] | None = None
 
@@ -143,13 +149,32 @@ class Curve:
         (regression with an error in the abscissa; Fuller 1987). In motion readings spread far wider than their noise.
         """
         place = self.h.copy()
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], (self.direction == 0).astype(np.int8), [0]))))
-        for start, stop in zip(edges[::2], edges[1::2], strict=True):
-            rows = start + np.flatnonzero(self.usable[start:stop])
+        for rows in self._stretches(0):
             if rows.size > 1 and np.std(self.h[rows]) <= HELD * self.displacement_noise:
                 place[rows] = self.h[rows].mean()
         place.setflags(write=False)
         return place
+
+    @cached_property
+    def velocity(self) -> Array:
+        """How fast the disk moves (m/s): from turn to turn the slope of a straight line through the readings, or 0."""
+        velocity = np.zeros(self.h.size)
+        if self.time is not None:
+            for rows in (*self._stretches(1), *self._stretches(-1)):
+                time, h = self.time[rows], self.h[rows]
+                if np.ptp(time) > 0.0:
+                    time = time - time.mean()
+                    velocity[rows] = (time @ h) / (time @ time)
+        velocity.setflags(write=False)
+        return velocity
+
+    def _stretches(self, direction: int) -> Iterator[NDArray[np.intp]]:
+        """The usable samples of every uninterrupted stretch in one direction; not those without any."""
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], (self.direction == direction).astype(np.int8), [0]))))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            rows = start + np.flatnonzero(self.usable[start:stop])
+            if rows.size:
+                yield rows
 
     def _column(self, name: str, dtype: Any, n: int) -> NDArray[Any]:
         """Replace a field by a read-only copy of itself as an array of n numbers."""

@@ -43,7 +43,7 @@ class IdentificationError(ValueError):
 class Nuisance:
     """An error of the rig that is fitted along: what kind, of which run, its prior standard uncertainty, which rows."""
 
-    kind: str  # force_zero, displacement_zero or compliance
+    kind: str  # force_zero, displacement_zero, lag or compliance
     run: str
     prior: float
     rows: tuple[int, ...]
@@ -135,14 +135,20 @@ class Problem:
         self.roots = [block.root / math.sqrt(self.inflation) for block in self.blocks]
         self.ways = [block.way for block in self.blocks]
         self._target = np.concatenate([block.target for block in self.blocks]) / math.sqrt(self.inflation)
+        self._stiffness = states.by["h"]  # N/m, at the nodes
+        self._late = {k: self._by_lag(one) for k, one in enumerate(self.nuisances) if one.kind == "lag"}
         self._last: tuple[bytes, Evaluation] | None = None
 
     def _nuisances(self) -> list[Nuisance]:
         found = []
         for run in dict.fromkeys(self.curves[i].run for i in self.active):
             rows = tuple(row for row, i in enumerate(self.active) if self.curves[i].run == run)
-            for kind in ("force_zero", "displacement_zero"):
-                prior = max(getattr(self.curves[self.active[row]], kind) for row in rows)
+            for kind, prior_of in (
+                ("force_zero", "force_zero"),
+                ("displacement_zero", "displacement_zero"),
+                ("lag", "lag_uncertainty"),
+            ):
+                prior = max(getattr(self.curves[self.active[row]], prior_of) for row in rows)
                 if prior > 0.0:
                     found.append(Nuisance(kind, run, prior, rows))
         rows = tuple(row for row, i in enumerate(self.active) if self.curves[i].compliance_uncertainty > 0.0)
@@ -233,14 +239,18 @@ class Problem:
                 force[:, nuisance.rows] += (points[:, k] * nuisance.prior)[:, None, None]
         residual = self.project(force[..., None])[..., 0]
         residual[:, :data] -= self._target
+        for k, late in self._late.items():
+            residual[:, :data] += points[:, self.film_parameters + k, None] * late
         residual[:, data:] = points[:, self.film_parameters :]
         jacobian = np.zeros((count, residual.shape[1], points.shape[1]))
         if slopes:
             by = self.by_parameters(points[:, None, None], *(solved.by[name] for name in ("mu", "alpha", "eps_r")))
             for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
-                rows = list(nuisance.rows)
-                by[..., k][:, rows] = self._by_nuisance(nuisance, solved)
+                if nuisance.kind != "lag":
+                    by[..., k][:, list(nuisance.rows)] = self._by_nuisance(nuisance, solved)
             jacobian = self.project(by)
+            for k, late in self._late.items():
+                jacobian[:, :data, self.film_parameters + k] = late
             jacobian[:, data:, self.film_parameters :] = np.eye(len(self.nuisances))
         answered = np.asarray(np.isfinite(force).all(axis=(1, 2)))
         residual[~answered] = INVALID_RESIDUAL
@@ -256,6 +266,8 @@ class Problem:
         for value, nuisance in zip(x[self.film_parameters :], self.nuisances, strict=True):
             if nuisance.kind == "force_zero" and row in nuisance.rows:
                 model += value * nuisance.prior
+            elif nuisance.kind == "lag" and row in nuisance.rows:
+                model -= value * nuisance.prior * curve.velocity[used] * (matrix @ self._stiffness[row])
         reference = float(self.voltage[row])
         if reference > 0.0:
             by_square = states.by["voltage"][row] / (2 * reference)
@@ -277,6 +289,19 @@ class Problem:
             return np.full((len(solved.force), len(rows), self.nodes.shape[1]), nuisance.prior)
         slope = nuisance.prior * solved.by["h"][:, rows]
         return slope if nuisance.kind == "displacement_zero" else -slope * self._give[rows]
+
+    def _by_lag(self, lag: Nuisance) -> Array:
+        """What force that is one prior too late does to the weighted residual rows: it is that of where the disk was.
+
+        Every sample has its own velocity, and so this passes by the nodes.
+        """
+        late = []
+        for block, row in zip(self.blocks, self.block_rows, strict=True):
+            curve = self.curves[self.active[row]]
+            slope = interpolation_matrix(self.nodes[row], curve.place[block.rows]) @ self._stiffness[row]
+            change = -lag.prior * curve.velocity[block.rows] * slope * (row in lag.rows)
+            late.append((change / block.sigma) @ block.base)
+        return np.concatenate(late) / math.sqrt(self.inflation)
 
     def _shift(self, points: Array) -> Array:
         """What the errors of the displacement add to the nodes (m), shape (S, rows, nodes)."""

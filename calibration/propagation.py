@@ -29,7 +29,12 @@ SYSTEMATIC = (
 )
 
 
-NUISANCES = {"force_zero": "N", "displacement_zero": "m", "compliance": "m/N"}  # what is fitted along, and its unit
+NUISANCES = {
+    "force_zero": "N",
+    "displacement_zero": "m",
+    "lag": "s",
+    "compliance": "m/N",
+}  # what is fitted along, and its unit
 
 
 def stiffening(curve: Curve) -> float:

@@ -25,6 +25,8 @@ from rig.toml_file import parse_table
 
 # Of a rig that nobody pressed on (m/N): load cells for a newton give way by some 0.3 mm at full scale.
 UNKNOWN_COMPLIANCE = 3e-4
+# Of the force behind the displacement where nobody measured it (s): filters of amplifiers and buffers of adapters.
+UNKNOWN_LAG = 5e-3
 NOISE_SIGMAS = 5.0  # by this much of its noise a sensor may read beyond its calibrated range
 # A sample belongs to its curve while the measured voltage is this near to the nominal one.
 VOLTAGE_V, VOLTAGE_PART = 50.0, 0.05
@@ -261,6 +263,9 @@ def errors_of(scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErr
     else:
         stage = certificates.get("stage")
         errors["compliance_uncertainty"] = UNKNOWN_COMPLIANCE if stage is None else stage.compliance_uncertainty
+    timed = [certificate for certificate in (force, laser) if certificate is not None]
+    known = [certificate.lag_uncertainty for certificate in timed]
+    errors["lag_uncertainty"] = math.hypot(*known) if all(known) else UNKNOWN_LAG
     if hv is not None:
         errors["voltage_gain"] = hv.gain_uncertainty
     return errors

@@ -65,6 +65,7 @@ class CurveErrors(TypedDict, total=False):
     disk_radius_uncertainty: float
     compliance_uncertainty: float
     eccentricity: float
+    lag_uncertainty: float
 
 
 @dataclass(frozen=True, eq=False)

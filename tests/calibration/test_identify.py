@@ -266,6 +266,29 @@ def test_what_is_advised_against_unseen_imperfections_rules_them_out(experiment:
     assert shifts([*curves[:3], held], "stiffness")[viscous] < 0.5 * shifts(curves, "stiffness")[viscous]
 
 
+def test_a_lag_between_the_sensors_is_found_within_its_prior_and_not_taken_for_a_viscous_film(
+    experiment: Experiment,
+) -> None:
+    """Force read 4 ms too late at 1 mm/s is that of a place 4 um behind: loading lies below unloading."""
+    options: dict[str, Any] = {"samples": 1000, "disks": (4e-3,), "noise": 2e-4, "truth": ONE_TERM, "guess": ONE_TERM}
+    late = []
+    for curve in experiment(3, voltages=(0.0, 1500.0), **options):
+        assert curve.time is not None
+        behind = np.interp(curve.time - 4e-3, curve.time, curve.force)
+        late.append(replace(curve, force=behind, displacement_noise=5e-6))
+    unaware = identify(late, terms=1, starts=1)
+    assert any("does not explain the data" in warning for warning in unaware.warnings)
+
+    found = identify([replace(curve, lag_uncertainty=5e-3) for curve in late], terms=1, starts=1)
+    assert not any("does not explain the data" in warning for warning in found.warnings)
+    lag = found.nuisance["lag of run-4mm"]
+    assert lag.prior == 5e-3 and lag.unit == "s"
+    assert lag.uncertainty < 0.5e-3
+    assert abs(lag.value - 4e-3) < 3.0 * lag.uncertainty
+    for name in ("eps_r", "G"):
+        assert deviation(found, name, {"eps_r": 1.7, "G": ONE_TERM.shear_modulus}[name]) < 3.0
+
+
 def test_a_wrong_disk_radius_is_reported_as_lack_of_fit(experiment: Experiment) -> None:
     curves = experiment(seed=2, guess=ONE_TERM, errors={}, noise=2e-3)
     wrong = [replace(c, specimen=replace(c.specimen, disk_radius=1.05 * c.specimen.disk_radius)) for c in curves[:3]]
