@@ -131,7 +131,12 @@ def measure(stand: Stand, row: Row, instant: float | None, rng: random.Random) -
         return run
     pid = run.guard if row.what == GUARD else run.engine
     number = {STOPPED: signal.SIGSTOP, SPINNING: signal.SIGUSR1}.get(row.what, signal.SIGKILL)
-    at = stand.kill(pid, number)
+    try:
+        at = stand.kill(pid, number)
+    except ProcessLookupError:  # it has ended this very moment
+        row.without += 1
+        stand.wait_until_alone(run)
+        return run
     if not stand.was_on(at):
         row.without += 1
     else:

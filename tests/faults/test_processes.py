@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from rig.benchmark.safety import kill_many
 from rig.benchmark.stand import Run, Stand
 from rig.log.reader import read_log
 from rig.safety.guard import AT_ONCE_S
@@ -115,17 +114,6 @@ def test_engine_gone_on_the_way_to_contact_leaves_the_stage_within_a_leg(
         assert run.status is None  # it is still there
         slow_stand.kill(run.engine)
     slow_stand.wait_until_alone(run)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(840)
-def test_engine_killed_at_200_random_instants(tmp_path: Path) -> None:
-    row = kill_many(tmp_path, 200, at_once=6, seed=1)
-    assert len(row.ms) + row.without == 200
-    assert len(row.ms) > 30  # so many had voltage on, or on its way
-    assert row.never == 0
-    assert row.quantile(0.5) < 1e3 * KILLED_S
-    assert max(row.ms) < 1e3 * 4 * KILLED_S
 
 
 @pytest.mark.slow
