@@ -118,12 +118,12 @@ def one_term(material: Material, stretches: tuple[float, float], hoop: float) ->
 def propose(places: Places, time: float, overhead: Overhead) -> list[Dwell]:
     """Where to hold the film and how long, in all no longer than ``time`` (s) with what getting there costs.
 
-    Returns the places in the order of the route: voltage by voltage, up and down in turn. Empty when the time is not
-    enough for any two places.
+    Returns the route: voltage by voltage, up and down in turn, and at last the lowest voltage once more. Empty when
+    the time is not enough for any two places.
     """
 
     def judged(these: Sequence[int]) -> tuple[float, list[Dwell]]:
-        left = time - overhead(_route(places, these, np.ones(len(these))))
+        left = time - overhead(_route(places, these, np.full(len(these), 2.0 * LEAST_DWELL)))
         if len(these) < 2 or left < LEAST_DWELL * len(these):
             return math.inf, []
         value, seconds = places.shared(left, these)
@@ -178,11 +178,21 @@ def _near(places: Places, one: int, other: int) -> bool:
 
 
 def _route(places: Places, these: Sequence[int], seconds: Array) -> list[Dwell]:
-    """Voltage by voltage upwards; the displacements of every other voltage in falling order."""
+    """Voltage by voltage upwards; the displacements of every other voltage in falling order.
+
+    Half of the longest stay at the lowest voltage comes at the end, so that a film or a sensor that changes with time
+    does not pass for an effect of the voltage.
+    """
     dwells = [
         Dwell(float(places.voltage[k]), float(places.h[k]), float(one)) for k, one in zip(these, seconds, strict=True)
     ]
     route = []
     for number, (_, group) in enumerate(itertools.groupby(sorted(dwells), key=lambda dwell: dwell.voltage)):
         route += sorted(group, key=lambda dwell: dwell.h, reverse=number % 2 == 1)
+    lowest = [dwell for dwell in route if dwell.voltage == route[0].voltage]
+    longest = max(lowest, key=lambda dwell: dwell.seconds)
+    if len(lowest) < len(route) and longest.seconds >= 2.0 * LEAST_DWELL:
+        half = replace(longest, seconds=0.5 * longest.seconds)
+        route[route.index(longest)] = half
+        route.append(half)
     return route

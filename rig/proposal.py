@@ -196,7 +196,7 @@ def _trimmed(scene: Scene, certificates: Mapping[str, Certificate], route: Seque
     top_h = max(dwell.h for dwell in route)
     for _ in range(3):
         middle = _steps(route, scene)
-        protocol = _protocol(scene, certificates, middle, top_h, f"Planned: {len(route)} places")
+        protocol = _protocol(scene, certificates, middle, top_h, f"Planned: {len(route)} holds")
         spare = time - _duration(protocol, scene)
         held = sum(dwell.seconds for dwell in route)
         route = [
@@ -211,10 +211,11 @@ def _steps(route: Sequence[Dwell], scene: Scene) -> list[steps.Step]:
     found: list[steps.Step] = []
     h = voltage = 0.0
     for dwell in route:
-        if dwell.h != h:  # before the voltage rises: the film bears the way at the lower one
-            found.append(steps.Ramp(do="ramp", displacement_mm=_mm(dwell.h), speed_mm_per_s=speed))
-        if dwell.voltage != voltage:
-            found.append(steps.Voltage(do="voltage", voltage_V=dwell.voltage, settle_s=SETTLE_S))
+        there = [steps.Ramp(do="ramp", displacement_mm=_mm(dwell.h), speed_mm_per_s=speed)] if dwell.h != h else []
+        changed = dwell.voltage != voltage
+        charged = [steps.Voltage(do="voltage", voltage_V=dwell.voltage, settle_s=SETTLE_S)] if changed else []
+        # The film is moved at the lower voltage of the two: that it bears.
+        found += [*charged, *there] if dwell.voltage < voltage else [*there, *charged]
         found.append(steps.Hold(do="hold", duration_s=max(dwell.seconds, 0.1)))
         h, voltage = dwell.h, dwell.voltage
     return found

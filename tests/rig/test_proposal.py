@@ -1,5 +1,6 @@
 """The planned protocol: inside limits and time, better than the uniform sweep, and so in simulated experiments."""
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -55,6 +56,21 @@ def test_the_file_is_a_protocol_that_the_check_lets_through(half: proposal.Propo
     experiment = prepare(SCENE, path)  # raises where a limit does not hold
     assert experiment.duration == pytest.approx(half.planned.duration)
     assert 270.0 < experiment.duration <= 300.0
+
+
+def test_half_of_the_longest_stay_without_voltage_comes_at_the_end(half: proposal.Proposal) -> None:
+    *route, last = half.route
+    voltages = [dwell.voltage for dwell in route]
+    assert voltages == sorted(voltages) and voltages[-1] > 0.0
+    assert last in route and last.voltage == 0.0
+    assert all(2 * last.seconds >= dwell.seconds for dwell in route if dwell.voltage == 0.0)
+    voltage = 0.0
+    for step, following in itertools.pairwise(half.planned.protocol.step):
+        if step.do == "voltage":
+            if step.voltage_V < voltage:  # nothing moves at the higher one
+                assert following.do == "ramp"
+            voltage = step.voltage_V
+    assert voltage == 0.0
 
 
 def test_limits_keep_places_out(tmp_path: Path) -> None:
@@ -166,7 +182,11 @@ def test_a_planned_run_on_the_simulated_bench_is_identified(tmp_path: Path) -> N
     outcome = run(prepare(SCENE, path), log, lambda done, total, label: None)
     assert outcome.duration <= 150.0
     found = identify_logs([log], terms=2).identification
-    assert len({curve.nominal_voltage for curve in found.curves}) == len(found.curves)
+    voltages = [curve.nominal_voltage for curve in found.curves]
+    assert voltages == [*sorted(set(voltages)), 0.0]
+    # 0 V once more at the end: a film that softens shows before it shifts the permittivity.
+    softening = found.unseen["film that softens from one curve to the next"]
+    assert abs(softening["eps_r"]) < found.quantities["eps_r"].uncertainty
     for name, known in (("eps_r", PARKER.eps_r), ("stiffness", secant_modulus(PARKER, *found.stretch))):
         quantity = found.quantities[name]
         assert abs(quantity.value - known) < 3.0 * quantity.uncertainty, name
