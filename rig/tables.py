@@ -205,9 +205,9 @@ def identification_table(found: Identification) -> Group:
             for name, shift in found.unseen[worst.name].items()
         )
         lines.append(
-            f"unseen: {len(found.blind_spots)} imperfections could be there without showing in these data and shift "
-            f"a result by more than its uncertainty, most of all: {worst.blind}, {', '.join(shifts)}. To rule it "
-            f"out: {worst.remedy}. The report lists them all."
+            f"unseen: {worst.blind} could be there without showing in these data and shift {', '.join(shifts)}. To "
+            f"rule it out: {worst.remedy}. The report lists all {len(found.blind_spots)} that could shift a result by "
+            "more than its uncertainty."
         )
     return Group(*lines)
 
