@@ -39,7 +39,7 @@ HYSTERESIS = "hysteresis: loading above unloading"
 # How each is ruled out or found, by the beginning of its name.
 REMEDIES = {
     "viscous film": "hold the film displaced, in the same run, for several times as long",
-    COMPLIANCE: "`dea-rig calibrate compliance`",
+    COMPLIANCE: "press on a rigid dummy in place of the film; what the displacement sensor reads then is compliance",
     SOFTENING: "measure the curve at the first voltage once more at the end",
     NOT_SQUARE: "`dea-rig calibrate hv`; compare fits of single voltages",
     HYSTERESIS: "give the curves with their times, and one more at another speed",
