@@ -218,9 +218,10 @@ def verify(quantity: Any, scene: Path, standard: float, out: Path, arm: bool, ye
         run_and_tell(experiment, log, arm=arm, yes=yes, take_down=False)
 
     found = verify_(quantity, scene, standard, out, run)
+    factor, unit = (1e3, "mm") if found.unit == "m" else (1.0, found.unit)
     click.echo(
-        f"{quantity}: applied {found.applied:.6g} {found.unit}, measured {found.measured:.6g} {found.unit}, "
-        f"U = {found.uncertainty:.2g} {found.unit} (k = 2), E_n = {found.normalised_error:+.2f}: "
+        f"{quantity}: applied {found.applied * factor:.6g} {unit}, measured {found.measured * factor:.6g} {unit}, "
+        f"U = {found.uncertainty * factor:.2g} {unit} (k = 2), E_n = {found.normalised_error:+.2f}: "
         + ("the certificate holds." if found.passed else "DOES NOT AGREE. Calibrate anew before you measure.")
     )
     if not found.passed:

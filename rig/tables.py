@@ -124,7 +124,8 @@ def calibration_table(found: Calibration) -> list[RenderableType]:
         else:
             per = f"{unit} per {found.reading_unit}"
             table.add_row(f"gain / {per}", f"{characteristic.gain:.7g}", f"{characteristic.gain * relative:.2g}")
-            table.add_row(f"zero / {unit}", f"{characteristic.zero * characteristic.gain:.4g}", "")
+            factor, unit = (1e6, "um") if unit == "m" else (1.0, unit)
+            table.add_row(f"zero / {unit}", f"{characteristic.zero * characteristic.gain * factor:.4g}", "")
             for name, value in (
                 ("noise of a sample", characteristic.noise),
                 ("zero, with drift", characteristic.zero_uncertainty),
@@ -133,10 +134,10 @@ def calibration_table(found: Calibration) -> list[RenderableType]:
                 ("linearity", characteristic.linearity),
                 *([("creep", found.creep)] if found.creep is not None else []),
             ):
-                table.add_row(f"{name} / {unit}", f"{value:.2g}", "")
+                table.add_row(f"{name} / {unit}", f"{value * factor:.2g}", "")
             top = characteristic.high
-            expanded = f"{characteristic.expanded_uncertainty(top):.2g}"
-            table.add_row(f"expanded uncertainty at {top:.4g} {unit}, k = 2 / {unit}", expanded, "")
+            expanded = f"{characteristic.expanded_uncertainty(top) * factor:.2g}"
+            table.add_row(f"expanded uncertainty at {top * factor:.5g} {unit}, k = 2 / {unit}", expanded, "")
         tables.append(table)
         budget = Table(title="Budget of the gain")
         for heading in ("component", "type", "relative, k = 1", "what it is"):
@@ -152,6 +153,12 @@ def calibration_table(found: Calibration) -> list[RenderableType]:
             row = f"{lag.lag * 1e3:.2f}", f"{lag.uncertainty * 1e3:.2f}", f"{lag.standing * 1e6:.2f}"
             lags.add_row(role, *row)
         tables.append(lags)
+    if found.quantity == "timing":
+        tables.append(Text("For the certificates, above their [findings], in place of what they say of the lag:"))
+        tables += [
+            Text(f"  {role}: lag_s = {lag.lag:.5f}, lag_uncertainty_s = {lag.uncertainty:.5f}", no_wrap=True)
+            for role, lag in sorted(found.lags.items())
+        ]
     return tables
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,16 +51,18 @@ def calibrate(
     if source.suffix == ".mcap":
         if protocol is not None:
             raise ConfigError("--protocol goes with a scene; a log holds its own.")
-        _make(out, *wanted)
+        with _made(out, *wanted):
+            found = analysis.calibrate(log, quantity)
     else:
         log, steps = out / f"{quantity}.mcap", protocol or out / f"{quantity}.protocol.toml"
         scene, _ = load_scene(source)
         text = protocol_text(quantity, scene) if protocol is None else ""
-        _make(out, *wanted, log, *([steps] if protocol is None else []))
-        if protocol is None:
-            write_text(steps, text)
-        run(prepare(source, steps), log)
-    found = analysis.calibrate(log, quantity)
+        with _made(out, *wanted, log, *([steps] if protocol is None else [])):
+            if protocol is None:
+                write_text(steps, text)
+            with _nothing_without_a_log(log, *([steps] if protocol is None else [])):
+                run(prepare(source, steps), log)
+        found = analysis.calibrate(log, quantity)
     if quantity != "timing":
         write_text(certificate, certificate_text(found, valid_days))
     from rig.calibrate.picture import draw
@@ -103,7 +107,8 @@ def verify(quantity: Quantity, scene_path: Path, standard: float, log: Path, run
     check_new(log, steps)
     text = verify_text(quantity, scene, standard)
     write_text(steps, text)
-    run(prepare(scene_path, steps), log)
+    with _nothing_without_a_log(log, steps):
+        run(prepare(scene_path, steps), log)
     return judge(log, quantity)
 
 
@@ -117,9 +122,10 @@ def judge(log: Path, quantity: Quantity) -> Verdict:
         standstills = analysis.standstills(run, quantity)
     except SensorError as error:
         raise DataError(f"{log}: {error}") from None
-    least = min(abs(one.applied) for one in standstills)
-    none = [one for one in standstills if abs(one.applied) <= least]
-    some = [one for one in standstills if abs(one.applied) > least]
+    # A meter reads some volts without voltage too: what is nearer to nothing than to the standard is its absence.
+    middle = 0.5 * max(abs(one.applied) for one in standstills)
+    none = [one for one in standstills if abs(one.applied) < middle]
+    some = [one for one in standstills if abs(one.applied) >= middle]
     if not (none and some):
         raise DataError(f"{log}: the check needs a standard and its absence.")
 
@@ -144,9 +150,30 @@ def judge(log: Path, quantity: Quantity) -> Verdict:
     return Verdict(UNIT[quantity], applied, measured, COVERAGE * math.hypot(*parts))
 
 
-def _make(out: Path, *files: Path) -> None:
+@contextmanager
+def _made(out: Path, *files: Path) -> Iterator[None]:
+    """Make the directory of new ``files``; it goes again when an error comes before anything is in it."""
+    new = not out.exists()
     try:
-        out.mkdir(exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{out}: this directory cannot be made: {error.strerror}.") from None
     check_new(*files)
+    try:
+        yield
+    except BaseException:
+        if new and not any(out.iterdir()):
+            out.rmdir()
+        raise
+
+
+@contextmanager
+def _nothing_without_a_log(log: Path, *steps: Path) -> Iterator[None]:
+    """Take ``steps`` away when the run of them fails before it has a log, so that it can be tried again."""
+    try:
+        yield
+    except BaseException:
+        if not any(log.parent.glob(f"{glob.escape(log.name)}*")):
+            for path in steps:
+                path.unlink(missing_ok=True)
+        raise

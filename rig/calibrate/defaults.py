@@ -72,10 +72,11 @@ def _compliance(scene: Scene) -> list[str]:
 
 
 def _hv(scene: Scene) -> list[str]:
-    top = _round_down(PART * (scene.limits.voltage_V or 0.0))
-    if not top > 0:
-        raise ConfigError("limits.voltage_V is 0 or missing; there is no voltage to calibrate at.")
-    return [*_zero(), *_mount("none"), *_meter([k * top / LEVELS for k in range(LEVELS + 1)])]
+    # Whole volts, as near to the limit as they go: a run may not ask for more than was calibrated.
+    step = math.floor(PART * (scene.limits.voltage_V or 0.0) / LEVELS)
+    if not step > 0:
+        raise ConfigError("limits.voltage_V is missing or too low; there is no voltage to calibrate at.")
+    return [*_zero(), *_mount("none"), *_meter([float(k * step) for k in range(LEVELS + 1)])]
 
 
 def _timing(scene: Scene) -> list[str]:

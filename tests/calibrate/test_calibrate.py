@@ -1,16 +1,19 @@
 """One calibration of every kind on the simulated bench: certificate, evidence, replay from its log, daily check."""
 
+import io
 import re
 import tomllib
+from datetime import date
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from rich.console import Console
 
 from calibration.certificate import load_certificate
 from calibration.propagation import secant_modulus
-from rig.calibrate.analysis import calibrate
+from rig.calibrate.analysis import Calibration, Lag, calibrate
 from rig.calibrate.certificate_file import certificate_text
 from rig.calibrate.defaults import protocol_text
 from rig.calibrate.plan import series
@@ -21,7 +24,8 @@ from rig.log.reader import read_log
 from rig.plan import check_plan, plan
 from rig.protocol import Protocol
 from rig.scene import load_scene
-from rig.toml_file import parse_table
+from rig.tables import calibration_table
+from rig.toml_file import load_table, parse_table
 
 FIXTURES = Path(str(files("sim_fixtures")))
 TRUTH = {
@@ -153,6 +157,25 @@ def test_daily_check_passes_a_good_sensor_and_fails_one_that_has_changed(tmp_pat
     assert words in said.output
 
 
+def test_the_daily_check_of_the_voltage_stands_on_the_voltage_asked_for(tmp_path, write_scene):
+    """Not on a mean with the readings without voltage, which a meter never shows as exactly nothing."""
+    said = call(
+        "verify", "hv", write_scene(tmp_path, "seed = 3\n", hv=True), "--standard", 800, "-o", tmp_path / "c.mcap"
+    )
+    assert said.exit_code == 0, said.output
+    numbers = re.search(r"applied ([\d.]+) V, measured ([\d.]+) V", said.output)
+    assert [float(one) for one in numbers.groups()] == pytest.approx([800.0, 800.0], abs=3.0)
+
+
+def test_what_timing_finds_is_told_as_lines_of_the_certificates():
+    lags = {"force": Lag("force", 0.0123, 0.0015, 0.0)}
+    found = Calibration("timing", None, None, lags, "", "", date(2020, 1, 1), "", "", Path("log.mcap"))
+    console = Console(width=100, file=io.StringIO())
+    for one in calibration_table(found):
+        console.print(one)
+    assert "force: lag_s = 0.01230, lag_uncertainty_s = 0.00150" in console.file.getvalue()
+
+
 # Certificates in use
 
 
@@ -232,3 +255,29 @@ def test_the_compliance_of_the_rig_is_taken_off_where_the_stage_stands_for_the_d
     assert stiffness.budget["compliance"] > 5.0 * rigid.quantities["stiffness"].budget["compliance"]
     told = {name: any("dea-rig calibrate compliance" in note for note in one.notes) for name, one in found.items()}
     assert told == {"rigid": False, "unknown": True, "corrected": False}
+
+
+def test_a_calibration_that_cannot_begin_leaves_nothing_in_its_way(tmp_path, write_scene):
+    """Neither the protocol that was written for it nor a new folder; a file that was there stays."""
+    scene = write_scene(tmp_path, "seed = 3\n" + TRUTH["force"])
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(scene.read_text().replace("/force.toml", "/gone.toml"))
+    for arguments in (("calibrate", "force", wrong, "-o", tmp_path / "new" / "folder"),
+                      ("verify", "force", wrong, "--standard", "60", "-o", tmp_path / "check.mcap"),
+                      ("calibrate", "force", tmp_path / "no.mcap", "-o", tmp_path / "other")):  # fmt: skip
+        assert call(*arguments).exit_code in (1, 2)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path not in (scene, wrong)]
+    assert not (tmp_path / "new" / "folder").exists()
+    assert not (tmp_path / "other").exists()
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "force.protocol.toml").write_text("mine")
+    assert call("calibrate", "force", wrong, "-o", tmp_path / "kept").exit_code == 2
+    assert (tmp_path / "kept" / "force.protocol.toml").read_text() == "mine"
+
+
+def test_the_usual_calibration_of_the_voltage_reaches_what_runs_ask_for():
+    scene, _ = load_scene(FIXTURES / "scenes" / "cone-4mm.toml")
+    steps = parse_table(protocol_text("hv", scene), Protocol, "protocol", "usual")
+    asked = load_table(FIXTURES / "protocols" / "paper.toml", Protocol, "protocol")[0]
+    reach = max(max(step.voltages_V) for step in steps.step if step.do == "meter")
+    assert max(max(step.voltages_V) for step in asked.step if step.do == "sweep") <= reach <= scene.limits.voltage_V
