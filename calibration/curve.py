@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -154,6 +154,20 @@ class Curve:
                 place[rows] = self.h[rows].mean()
         place.setflags(write=False)
         return place
+
+    def without_compliance(self, compliance: float) -> Curve:
+        """The curve with the way that a rig of ``compliance`` (m/N) gives taken off the displacement.
+
+        Where the disk is held it is taken from the mean force: the noise of the single readings would pass for motion
+        against the force, as of a film of negative stiffness. Held is what the film, at its mean stiffness, would
+        answer with less force than the noise.
+        """
+        force = self.force.copy()
+        for rows in self._stretches(0):
+            mean = float(force[rows].mean())
+            if np.std(self.h[rows]) * abs(mean) <= self.force_noise * abs(self.h[rows].mean()):
+                force[rows] = mean
+        return replace(self, h=self.h - compliance * force)
 
     @cached_property
     def velocity(self) -> Array:

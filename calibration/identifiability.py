@@ -13,6 +13,7 @@ from calibration.problem import IdentificationError, Problem
 from calibration.propagation import Statement, state
 from calibration.reduction import select
 from calibration.result import WEAKLY_IDENTIFIED, Quantity
+from calibration.rounding import two_digits
 from model.materials import Material
 
 FARTHER = 1.5  # times the displacement reached so far
@@ -91,5 +92,5 @@ def _added(curve: Curve, farther: float, prestretch: float) -> Curve:
 
 def _percent(relative: float) -> str:
     if relative > 10.0:
-        return f"{relative:.0f} times its value"
+        return f"{two_digits(relative)} times its value"
     return f"{100 * relative:.2g} %" if relative < 1.0 else f"{100 * relative:.0f} %"

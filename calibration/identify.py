@@ -511,6 +511,13 @@ def _interpolation_errors(problem: Problem, film: Material) -> Array:
     )
 
 
+_ASK_ZERO = "was it taken in contact, or did it drift?"
+_ASK = {  # by the beginning of the nuisance's name; else it is a zero
+    "lag": "`dea-rig calibrate timing` tells how far the sensors lag, for their certificates",
+    "compliance": "`dea-rig calibrate compliance` tells",
+}
+
+
 def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
     words = []
     if not fit.converged:
@@ -553,7 +560,7 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
         if abs(zero.value) > 3.0 * zero.prior:
             words.append(
                 f"the {name} had to move by {zero.value / zero.prior:+.1f} of its stated standard uncertainties; "
-                "was it taken in contact, or did it drift?"
+                + next((ask for beginning, ask in _ASK.items() if name.startswith(beginning)), _ASK_ZERO)
             )
     if not problem.electric and any(curve.nominal_voltage != 0.0 for curve in problem.curves):
         words.append("no sample with voltage is left after the exclusions: the permittivity was not identified")

@@ -18,7 +18,7 @@ from calibration.identify import secant_modulus
 from calibration.misfit import SHOWN, Suspect
 from calibration.reduction import select
 from calibration.result import CONVENTION, IDENTIFIED, WEAKLY_IDENTIFIED, Identification, Quantity
-from calibration.rounding import percent, rounded, two_digits
+from calibration.rounding import percent, rounded, stated, two_digits
 from model.materials import Material
 
 
@@ -144,7 +144,7 @@ def _row(name: str, quantity: Quantity, known: Mapping[str, float]) -> _Row:
         "alpha": "Ogden exponent",
     }[base if base in ("mu", "alpha") else name]
     factor, unit = (1e-3, "kPa") if quantity.unit == "Pa" else (1.0, "")
-    value, uncertainty = rounded(quantity.value * factor, quantity.uncertainty * factor)
+    value, uncertainty = stated(quantity.value * factor, quantity.uncertainty * factor)
     ends = quantity.interval or tuple(quantity.value + k * quantity.uncertainty for k in (-1.96, 1.96))
     low, high = (
         rounded(end * factor, quantity.uncertainty * factor)[0] if math.isfinite(end) else "no bound" for end in ends

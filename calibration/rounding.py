@@ -13,6 +13,13 @@ def rounded(value: float, uncertainty: float) -> tuple[str, str]:
     return f"{value:.{digits}f}", f"{uncertainty:.{digits}f}"
 
 
+def stated(value: float, uncertainty: float) -> tuple[str, str]:
+    """As `rounded`; of an uncertainty above ten times the value, which by then is a guess, only that it is."""
+    if not 0.0 < 10.0 * abs(value) < uncertainty < math.inf:
+        return rounded(value, uncertainty)
+    return two_digits(value), f"> {two_digits(10.0 * abs(value))}"
+
+
 def two_digits(value: float) -> str:
     """A number as text, to two significant digits, without a power of ten where people write none."""
     return f"{float(f'{value:.1e}'):g}"

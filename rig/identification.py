@@ -111,7 +111,7 @@ def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certi
     stage = certificates.get("stage")
     if run.has_laser or stage is None:
         return curve
-    return replace(curve, h=curve.h - stage.compliance * curve.force)
+    return curve.without_compliance(stage.compliance)
 
 
 def _in_calibrated_range(curve: Curve, certificates: Mapping[str, Certificate]) -> Curve:

@@ -235,7 +235,7 @@ def comparison_table(found: Sequence[Identification]) -> Table:
 
 def _quantities(title: str, quantities: Mapping[str, Quantity]) -> Table:
     """Values to the digits of their uncertainties; no number is cut on a narrow terminal."""
-    from calibration.rounding import percent, rounded
+    from calibration.rounding import percent, stated
 
     table = Table(title=title)
     table.add_column("quantity", overflow="fold")
@@ -248,7 +248,7 @@ def _quantities(title: str, quantities: Mapping[str, Quantity]) -> Table:
         factor, unit = _SHOWN.get(quantity.unit, (1.0, quantity.unit))
         table.add_row(
             _NAMES.get(name, name),
-            *rounded(quantity.value * factor, quantity.uncertainty * factor),
+            *stated(quantity.value * factor, quantity.uncertainty * factor),
             unit,
             percent(quantity.relative),
             quantity.verdict + (" (at its bound)" if quantity.at_bound else ""),
@@ -273,7 +273,7 @@ def tests_table(found: TestsFit) -> Group:
 def truth_table(found: Found) -> RenderableType:
     """The simulation's hidden truth beside what was identified, the difference in stated standard uncertainties."""
     from calibration.identify import secant_modulus
-    from calibration.rounding import rounded
+    from calibration.rounding import stated
 
     truth, identification = found.truth, found.identification
     if truth is None:
@@ -295,7 +295,7 @@ def truth_table(found: Found) -> RenderableType:
     for name, quantity in identification.quantities.items():
         if name in known:
             factor, unit = _SHOWN.get(quantity.unit, (1.0, quantity.unit))
-            value, uncertainty = rounded(quantity.value * factor, quantity.uncertainty * factor)
+            value, uncertainty = stated(quantity.value * factor, quantity.uncertainty * factor)
             off = (quantity.value - known[name]) / quantity.uncertainty
             row = (f"{known[name] * factor:.6g}", value, unit, uncertainty, f"{off:+.2f}")
             table.add_row(_NAMES.get(name, name), *row)

@@ -60,3 +60,15 @@ def test_a_curve_does_not_change_with_the_arrays_it_was_made_from() -> None:
     assert made.force[0] == 0.01
     with pytest.raises(ValueError, match="read-only"):
         made.force[0] = 1.0
+
+
+def test_the_noise_of_the_force_does_not_move_a_held_disk_by_the_rigs_compliance() -> None:
+    """Readings at rest would lie on a line of the slope -1/compliance: a film of negative stiffness, if believed."""
+    rng = np.random.default_rng(5)
+    way = np.concatenate([np.linspace(0.0, 6e-3, 100), np.full(400, 6e-3)])
+    force = 20.0 * way + 2e-3 * rng.standard_normal(way.size)
+    direction = np.repeat([1, 0], [100, 400])
+    made = curve(h=way, force=force, voltage=np.zeros(way.size), direction=direction).without_compliance(1e-4)
+    assert np.ptp(made.place[100:]) == 0.0
+    assert made.place[-1] == pytest.approx(6e-3 - 1e-4 * 0.12, abs=5e-8)
+    assert made.h[:100] == pytest.approx(way[:100] - 1e-4 * force[:100], abs=1e-12)

@@ -288,6 +288,10 @@ def test_a_lag_between_the_sensors_is_found_within_its_prior_and_not_taken_for_a
     for name in ("eps_r", "G"):
         assert deviation(found, name, {"eps_r": 1.7, "G": ONE_TERM.shear_modulus}[name]) < 3.0
 
+    sure = identify([replace(curve, lag_uncertainty=1e-3) for curve in late], terms=1, starts=1)
+    (told,) = (warning for warning in sure.warnings if "had to move" in warning)
+    assert "the lag of" in told and "calibrate timing" in told and "contact" not in told
+
 
 def test_a_wrong_disk_radius_is_reported_as_lack_of_fit(experiment: Experiment) -> None:
     curves = experiment(seed=2, guess=ONE_TERM, errors={}, noise=2e-3)

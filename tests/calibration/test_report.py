@@ -13,7 +13,7 @@ from calibration.curve import Curve
 from calibration.identify import identify
 from calibration.report import write_report
 from calibration.result import Identification
-from calibration.rounding import percent, rounded
+from calibration.rounding import percent, rounded, stated
 from model.materials import NAMED
 
 Experiment = Callable[..., list[Curve]]
@@ -156,6 +156,16 @@ def test_without_voltage_the_report_has_no_permittivity(
 )
 def test_rounding(value: float, uncertainty: float, expected: tuple[str, str]) -> None:
     assert rounded(value, uncertainty) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "expected"),
+    [(2.1278, 23488226648.0, ("2.1", "> 21")), (33.587, 264.9, ("34", "265")), (-24.3, 19338.0, ("-24", "> 240"))],
+)
+def test_an_uncertainty_far_above_its_value_has_no_digits(
+    value: float, uncertainty: float, expected: tuple[str, str]
+) -> None:
+    assert stated(value, uncertainty) == expected
 
 
 @pytest.mark.parametrize(
