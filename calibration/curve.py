@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 HELD = 2.0  # times its noise: a displacement that scatters no more did not move
+BEND, FEWEST = 0.05, 4  # part of a way off a straight line that is a change of speed; samples that make a line
 UNCERTAINTIES = (
     "displacement_noise",
     "force_gain",
@@ -75,8 +76,8 @@ class Curve:
     eccentricity : float
         Standard uncertainty of the distance of the disk's centre from the ring's (m).
     lag_uncertainty : float
-        Standard uncertainty (s) of how much later than the displacement the force was taken; the same error in all
-        curves of a run. It bears on curves with ``time``.
+        Standard uncertainty (s) of how far the force is behind the displacement: force read at ``t`` is that of where
+        the disk was a lag before. The same error in all curves of a run; it bears on curves with ``time``.
     time : ndarray, shape (n,), optional
         When each sample was taken, on the clock of its run (s). With it a viscous film can be told from other errors.
     flagged : ndarray of bool, shape (n,), optional
@@ -171,16 +172,33 @@ class Curve:
 
     @cached_property
     def velocity(self) -> Array:
-        """How fast the disk moves (m/s): from turn to turn the slope of a straight line through the readings, or 0."""
+        """How fast the disk moves (m/s); 0 while it is held, and without ``time``.
+
+        The slope of a straight line through the readings from turn to turn, or to where the speed changes.
+        """
         velocity = np.zeros(self.h.size)
         if self.time is not None:
-            for rows in (*self._stretches(1), *self._stretches(-1)):
-                time, h = self.time[rows], self.h[rows]
-                if np.ptp(time) > 0.0:
-                    time = time - time.mean()
-                    velocity[rows] = (time @ h) / (time @ time)
+            for stretch in (*self._stretches(1), *self._stretches(-1)):
+                travel = abs(float(self.h[stretch[-1]] - self.h[stretch[0]]))
+                for rows in self._straight(self.time, stretch, max(BEND * travel, 5.0 * self.displacement_noise)):
+                    time, h = self.time[rows], self.h[rows]
+                    if np.ptp(time) > 0.0:
+                        time = time - time.mean()
+                        velocity[rows] = (time @ h) / (time @ time)
         velocity.setflags(write=False)
         return velocity
+
+    def _straight(self, time: Array, rows: NDArray[np.intp], allowed: float) -> Iterator[NDArray[np.intp]]:
+        """Pieces of a stretch that are straight in time but for ``allowed`` (m), by Ramer, Douglas and Peucker."""
+        t, h = time[rows] - time[rows[0]], self.h[rows]
+        if rows.size >= 2 * FEWEST and t[-1] > 0.0:
+            off = np.abs(h - h[0] - (h[-1] - h[0]) * t / t[-1])
+            bend = int(off.argmax())
+            if off[bend] > allowed and FEWEST <= bend <= rows.size - FEWEST:
+                yield from self._straight(time, rows[:bend], allowed)
+                yield from self._straight(time, rows[bend:], allowed)
+                return
+        yield rows
 
     def _stretches(self, direction: int) -> Iterator[NDArray[np.intp]]:
         """The usable samples of every uninterrupted stretch in one direction; not those without any."""

@@ -49,9 +49,10 @@ def advice(
         return []
     now = expected_uncertainties(curves, material)
     worst = max(raw, key=lambda name: now[name].relative)
-    least = min(abs(curve.nominal_voltage) for curve in curves)
-    plain = [curve for curve in curves if abs(curve.nominal_voltage) == least]
-    farthest = max(float(np.nanmax(curve.h)) for curve in plain)
+    given = [curve for curve in curves if curve.usable.any()]
+    least = min(abs(curve.nominal_voltage) for curve in given)
+    plain = [curve for curve in given if abs(curve.nominal_voltage) == least]
+    farthest = max(float(curve.place[curve.usable].max()) for curve in plain)
     factor = min(FARTHER, reach / farthest)
     candidates, words = {}, []
     if factor > 1.02:

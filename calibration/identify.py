@@ -1,10 +1,11 @@
 """Ogden parameters and permittivity of a film from its force-displacement curves, with uncertainties to be believed.
 
-All curves, voltages and specimens are fitted at once. The film's parameters enter as stiffness shares
-``g_n = mu_n alpha_n / (2 G_0) > 0`` and exponents ``alpha_n``, all of order one, with ``eps_r`` where there is
-voltage. The zeros of force and displacement of each run are nuisance parameters whose prior is their stated
-uncertainty. Gains and the specimen's dimensions are not fitted, because the data must not be allowed to excuse a wrong
-model with a wrong gain: their uncertainties are propagated linearly (JCGM 100:2008, 5.1) and stated apart.
+All curves, voltages and specimens are fitted at once. The film's parameters enter as stiffness shares ``g_n = mu_n
+alpha_n / (2 G_0) > 0`` and exponents ``alpha_n``, all of order one, with ``eps_r`` where there is voltage. The zeros
+of force and displacement and the lag of the force of each run, and the rig's compliance, are nuisance parameters whose
+prior is their stated uncertainty. Gains and the specimen's dimensions are not fitted, because the data must not be
+allowed to excuse a wrong model with a wrong gain: their uncertainties are propagated linearly (JCGM 100:2008, 5.1) and
+stated apart.
 
 Convention of the Ogden terms: `model.materials.Material`.
 """
@@ -120,7 +121,9 @@ def identify(
             fits = _search(search, _scaled(points, curves), held)
             best = _representative(fits)
             material = search.film(best.x)
-        problem = Problem(curves, selections, terms, material, nodes=nodes, wrinkling=wrinkling)
+        problem = Problem(
+            curves, selections, terms, material, nodes=nodes, wrinkling=wrinkling, compliance=best.compliance
+        )
         best = _polish(problem, best, held) or best
         material = problem.film(best.x)
         previous, selections = selections, select(curves, material, wrinkling)
@@ -175,13 +178,12 @@ def compare(curves: Sequence[Curve], *, terms: Sequence[int] = (1, 2, 3), **opti
 
 def _scaled(materials: Sequence[Material], curves: Sequence[Curve]) -> list[Material]:
     """The materials made as stiff as the curves with the least voltage say they are."""
-    least = min(abs(curve.nominal_voltage) for curve in curves)
     rows = [curve.usable & (curve.h > 0.0) for curve in curves]
-    plain = [
-        (curve, used)
-        for curve, used in zip(curves, rows, strict=True)
-        if abs(curve.nominal_voltage) == least and used.any()
-    ]
+    given = [(curve, used) for curve, used in zip(curves, rows, strict=True) if used.any()]
+    if not given:  # why, the selection of samples will tell
+        return list(materials)
+    least = min(abs(curve.nominal_voltage) for curve, _ in given)
+    plain = [(curve, used) for curve, used in given if abs(curve.nominal_voltage) == least]
     specimens = np.empty((len(materials), len(plain), 1), dtype=np.object_)
     for s, material in enumerate(materials):
         specimens[s, :, 0] = [curve.specimen.with_material(material) for curve, _ in plain]
@@ -248,6 +250,12 @@ class _Fit:
     converged: bool
     varied: NDArray[np.bool_]
     at_bound: NDArray[np.bool_]
+
+    @property
+    def compliance(self) -> float:
+        """The rig's, beyond that believed (m/N)."""
+        found = zip(self.problem.nuisances, self.x[self.problem.film_parameters :], strict=True)
+        return sum(one.prior * float(value) for one, value in found if one.kind == "compliance")
 
     def restarted(self, problem: Problem) -> Array:
         """This minimum as a starting point of ``problem``, whose scale and set of nuisances may differ."""

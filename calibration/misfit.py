@@ -180,6 +180,8 @@ def _viscous(problem: Problem, x: Array) -> dict[float, Array]:
         time, force = np.concatenate(times), np.concatenate(elastic)
         order = np.argsort(time, kind="stable")
         grid = np.linspace(time.min(), time.max(), INSTANTS)
+        if grid[0] == grid[-1]:
+            continue  # no time to relax in
         longest = max(longest, float(grid[-1] - grid[0]))
         extra = _maxwell(grid[1] - grid[0], np.interp(grid, time[order], force[order]))
         for k, at in zip(mine, times, strict=True):

@@ -119,10 +119,10 @@ def posterior(
     except ImportError:
         raise IdentificationError("the posterior needs the package emcee: uv sync --extra posterior") from None
 
-    wrinkling = found.provenance.get("settings", {}).get("wrinkling", "plain")
-    problem = Problem(
-        curves, select(curves, found.material, wrinkling), found.terms, found.material, wrinkling=wrinkling
-    )
+    selections = select(curves, found.material, found.wrinkling)
+    rig = found.nuisance.get("compliance of the rig")
+    compliance = 0.0 if rig is None else rig.value
+    problem = Problem(curves, selections, found.terms, found.material, wrinkling=found.wrinkling, compliance=compliance)
     best = problem.vector(found.material)
     low, high = problem.bounds(best)
     rng = np.random.default_rng(seed)

@@ -28,6 +28,7 @@ from model.specimen import Specimen
 Array = NDArray[np.float64]
 
 NODES = 8  # of every part of a curve, to begin with
+GIVING = 3  # rounds after which force and giving way agree; each is off by a few per cent of the one before
 TOLERANCE = 1e-7  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
 SHARE_BOUNDS = (1e-6, 100.0)  # positive: so is every mu_n alpha_n, which makes the film stable at any stretch
 EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
@@ -72,7 +73,8 @@ class Problem:
     """Residuals and Jacobian of one pass, with the choice of samples and their weights fixed.
 
     The parameter vector ``x`` is ``[g_1..g_N, alpha_1..alpha_N, (eps_r), nuisances...]``; nuisances are in units of
-    their priors. Each part of a curve is a row of ``nodes``, and ``active`` names the curve of each row.
+    their priors. Each part of a curve is a row of ``nodes``, and ``active`` names the curve of each row. The rig gives
+    way by the force of the material ``at``, where its ``compliance`` (m/N, beyond that believed) holds the disk.
     ``solved`` counts the membrane states that were computed: rows times nodes for an evaluation, whatever the number
     of samples.
     """
@@ -88,6 +90,7 @@ class Problem:
         nodes: int = NODES,
         tolerance: float = TOLERANCE,
         wrinkling: Wrinkling = "plain",
+        compliance: float = 0.0,
     ) -> None:
         self.curves = curves
         self.selections = selections
@@ -114,10 +117,14 @@ class Problem:
         self.names += [f"{nuisance.kind}_{k}" for k, nuisance in enumerate(self.nuisances)]
 
         self._give = np.zeros_like(self.nodes)  # force (N) by which the rig gives way at the nodes
-        states = self._solve([at], np.zeros((1, *self.nodes.shape)))[0]
+        x = np.zeros(len(self.names))
+        for k, one in enumerate(self.nuisances, start=self.film_parameters):
+            x[k] = compliance / one.prior if one.kind == "compliance" else 0.0
+        for _ in range(GIVING if x[self.film_parameters :].any() else 1):
+            states = self._solve([at], self._shift(x[None]))[0]
+            self._give = states.force
         if not np.isfinite(states.force).all():
             raise IdentificationError("the membrane has no state at the starting guess, where its status says it has")
-        self._give = states.force
         self.blocks: list[Block] = []
         self.block_rows: list[int] = []
         for row, (i, part) in enumerate(self.parts):

@@ -160,10 +160,13 @@ def targets(problem: Problem, stretch: tuple[float, float], held: Collection[str
 def widened(quantity: Quantity, ends: tuple[float, float], misfit: float) -> Quantity:
     """``quantity`` with its 95 % interval, and with a part "nonlinearity" where the profile is wider than the line.
 
-    The profile knows noise, zeros and misfit; the systematic parts are added to its half-widths in squares.
+    The profile knows noise, zeros and misfit; the systematic parts, and what an imperfection that was found does to
+    the quantity, are added to its half-widths in squares.
     """
     parts = [*(part for part, *_ in SYSTEMATIC), "eccentricity"]
-    systematic = math.hypot(*(quantity.budget.get(part, 0.0) for part in parts))
+    known = (misfit - 1.0) * quantity.budget["noise"] ** 2  # of the lack of fit: the profile is as much wider
+    bias = math.sqrt(max(0.0, quantity.budget.get("lack of fit", 0.0) ** 2 - known))
+    systematic = math.hypot(bias, *(quantity.budget.get(part, 0.0) for part in parts))
     low, high = (
         quantity.value + math.copysign(math.hypot(end - quantity.value, NORMAL_95 * systematic), end - quantity.value)
         for end in ends

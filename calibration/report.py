@@ -99,7 +99,7 @@ def _render(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = environment.from_string((files("calibration") / "report.html.j2").read_text(encoding="utf-8"))
-    selections = select(curves, identification.material)
+    selections = select(curves, identification.material, identification.wrinkling)
     known = _truth(identification, truth)
     rows = {name: _row(name, quantity, known) for name, quantity in identification.quantities.items()}
     parts = list(dict.fromkeys(part for quantity in identification.quantities.values() for part in quantity.budget))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from calibration.held_out import HeldOut
 from calibration.misfit import Suspect
 from model.materials import Material
+from model.membrane import Wrinkling
 
 if TYPE_CHECKING:
     from calibration.posterior import Posterior
@@ -56,9 +57,11 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Zero:
-    """A correction to the zero of force or displacement in one run, found with the film's parameters.
+    """An error of the rig that was found with the film's parameters.
 
-    ``prior`` is the standard uncertainty that was stated for it, ``uncertainty`` the one that is left.
+    ``prior`` is the standard uncertainty that was stated for it, ``uncertainty`` the one that is left. A force zero
+    is what the force was read too large; a displacement zero what the displacement was read too small. A lag is how far
+    the force was behind the displacement, a compliance what had not been taken off the displacement.
     """
 
     value: float
@@ -114,7 +117,7 @@ class Identification:
     least_tangent : float
         Smallest tangent modulus (Pa) over the stretches reached; positive for a stable film.
     nuisance : dict of str to Zero
-        Zeros of force (N) and displacement (m) of every run, as corrections to what was measured.
+        Zeros of force (N) and displacement (m) and lag of the force (s) of every run, and the rig's compliance (m/N).
     chi_square, freedom : float, int
         Of all samples, in their stated standard deviations.
     lack_of_fit, lack_of_fit_freedom, lack_of_fit_probability : float, int, float
@@ -176,6 +179,12 @@ class Identification:
     def terms(self) -> int:
         """Number of Ogden terms."""
         return len(self.material.mu)
+
+    @property
+    def wrinkling(self) -> Wrinkling:
+        """What became of samples at which the film is wrinkled; see `calibration.identify.identify`."""
+        found: Wrinkling = self.provenance.get("settings", {}).get("wrinkling", "plain")
+        return found
 
     @property
     def reduced_chi_square(self) -> float:

@@ -149,6 +149,15 @@ def _notes(runs: Sequence[Run]) -> list[str]:
                 f"is fitted along (within {1e6 * UNKNOWN_COMPLIANCE:.0f} um/N), which makes the results less certain. "
                 "`dea-rig calibrate compliance` tells"
             )
+        for there, role, device in (
+            (run.has_laser, "displacement", "displacement sensor"),
+            (run.has_hv, "hv", "HV supply"),
+        ):
+            if there and role not in run.certificates:
+                notes.append(
+                    f"{log.path}: the {device} has no certificate; its readings are taken as they are, and the "
+                    f"uncertainties contain nothing of their errors. `dea-rig calibrate {role}` makes one"
+                )
         if not log.whole:
             notes.append(f"{log.path} is cut short or damaged; `dea-rig info {log.path}` tells what is missing")
         status = (log.outcome or {}).get("status", "unknown")
@@ -260,12 +269,13 @@ def errors_of(scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErr
     if laser is not None:
         errors["displacement_noise"] = laser.noise
         errors["displacement_gain"] = laser.gain_uncertainty
-    else:
+    elif scene.displacement is None:
         stage = certificates.get("stage")
         errors["compliance_uncertainty"] = UNKNOWN_COMPLIANCE if stage is None else stage.compliance_uncertainty
     timed = [certificate for certificate in (force, laser) if certificate is not None]
     known = [certificate.lag_uncertainty for certificate in timed]
-    errors["lag_uncertainty"] = math.hypot(*known) if all(known) else UNKNOWN_LAG
+    complete = all(known) and (laser is not None or scene.displacement is None)
+    errors["lag_uncertainty"] = math.hypot(*known) if complete else UNKNOWN_LAG
     if hv is not None:
         errors["voltage_gain"] = hv.gain_uncertainty
     return errors

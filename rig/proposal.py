@@ -254,7 +254,12 @@ def recorded(
     for voltage, pieces in parts.items():
         h, direction = (np.concatenate(columns) for columns in zip(*pieces, strict=True))
         every = math.ceil(h.size / MOST_SAMPLES)
-        thinned = {**errors, "force_noise": errors["force_noise"] / math.sqrt(every)}
+        less = math.sqrt(every)
+        thinned = {
+            **errors,
+            "force_noise": errors["force_noise"] / less,
+            "displacement_noise": errors.get("displacement_noise", 0.0) / less,
+        }
         curves.append(
             Curve(
                 label=f"{voltage:g} V",

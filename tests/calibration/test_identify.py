@@ -293,6 +293,32 @@ def test_a_lag_between_the_sensors_is_found_within_its_prior_and_not_taken_for_a
     assert "the lag of" in told and "calibrate timing" in told and "contact" not in told
 
 
+def test_the_speed_of_the_disk_may_change_on_the_way(experiment: Experiment) -> None:
+    """Half of the way at 0.1 mm/s, the other half thirty times as fast: a lag belongs to the speed of each."""
+    time = np.concatenate((np.linspace(0.0, 60.0, 500), np.linspace(60.02, 62.0, 100)))
+    way = np.interp(time, (0.0, 60.0, 62.0), (0.0, 6e-3, 12e-3))
+    time, way = np.concatenate((time, 124.0 - time[::-1])), np.concatenate((way, way[::-1]))
+    random, late = np.random.default_rng(5), []
+    for curve in experiment(3, samples=1200, disks=(4e-3,), voltages=(0.0, 1500.0), truth=ONE_TERM, guess=ONE_TERM):
+        force = solve_many(curve.specimen, way, curve.nominal_voltage).force
+        late.append(
+            replace(
+                curve,
+                h=way + 5e-6 * random.standard_normal(way.size),
+                force=np.interp(time - 4e-3, time, force) + 2e-4 * random.standard_normal(way.size),
+                force_noise=2e-4,
+                time=time,
+                lag_uncertainty=5e-3,
+            )
+        )
+    for speed, half in ((1e-4, slice(10, 490)), (3e-3, slice(510, 590)), (-3e-3, slice(610, 690))):
+        assert late[0].velocity[half] == pytest.approx(speed, rel=0.02)
+    found = identify(late, terms=1, starts=1)
+    assert found.lack_of_fit_probability > 1e-3
+    lag = found.nuisance["lag of run-4mm"]
+    assert abs(lag.value - 4e-3) < 3.0 * lag.uncertainty < 1e-3
+
+
 def test_a_wrong_disk_radius_is_reported_as_lack_of_fit(experiment: Experiment) -> None:
     curves = experiment(seed=2, guess=ONE_TERM, errors={}, noise=2e-3)
     wrong = [replace(c, specimen=replace(c.specimen, disk_radius=1.05 * c.specimen.disk_radius)) for c in curves[:3]]
@@ -457,8 +483,8 @@ def test_provenance_is_kept(experiment: Experiment) -> None:
     ("change", "words"),
     [
         (lambda c: replace(c, force=-c.force), "sign of the force"),
-        (lambda c: replace(c, force=np.full(c.h.size, np.nan)), "does not rise|no sample is left"),
-        (lambda c: replace(c, flagged=np.ones(c.h.size, dtype=bool)), "does not rise|no sample is left"),
+        (lambda c: replace(c, force=np.full(c.h.size, np.nan)), "no sample is left to fit: .*without a value"),
+        (lambda c: replace(c, flagged=np.ones(c.h.size, dtype=bool)), "no sample is left to fit: .*flagged"),
     ],
 )
 def test_hopeless_data_are_refused_in_words(
@@ -466,6 +492,15 @@ def test_hopeless_data_are_refused_in_words(
 ) -> None:
     with pytest.raises(IdentificationError, match=words):
         identify([change(curve) for curve in experiment(seed=8, samples=100)])
+
+
+def test_a_curve_without_any_value_takes_nothing_from_the_others(experiment: Experiment) -> None:
+    """It is the one with the least voltage: starting points and advice come from those that hold something."""
+    curves = experiment(seed=8, samples=100, disks=(4e-3,), voltages=(0.0, 1000.0, 1500.0), guess=ONE_TERM)
+    lost = replace(curves[0], h=np.full(100, np.nan))
+    found = identify([lost, *curves[1:]], terms=2, starts=1)
+    assert [curve.used > 0 for curve in found.curves] == [False, True, True]
+    assert any("would bring" in words for words in found.advice)
 
 
 def test_no_curves_are_refused() -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,6 +32,23 @@ def test_one_term_is_linear_and_its_intervals_are_symmetric(experiment: Experime
         assert quantity.budget.get("nonlinearity", 0.0) < 1e-3 * quantity.uncertainty
     assert found.quantities["mu1"].interval is None
     assert json.loads(found.to_json())["quantities"]["G"]["interval_95"] == list(found.quantities["G"].interval or ())
+
+
+def test_an_imperfection_that_was_found_is_in_the_intervals_too(
+    experiment: Experiment, relaxed: Callable[..., list[Curve]]
+) -> None:
+    """A viscous film shifts the permittivity by several times what noise does, which the profile does not know of."""
+    film = replace(PARKER, mu=(37_834.0,), alpha=(5.4985,))
+    curves = relaxed(experiment(seed=1, samples=200, truth=film, guess=film), film, 0.05, 30.0)
+    found = identify(curves, terms=1, starts=1, profiles=True)
+    assert found.suspects[0].significant
+    for name in ("G", "stiffness", "eps_r"):
+        quantity = found.quantities[name]
+        assert quantity.interval is not None
+        low, high = quantity.interval
+        assert (high - low) / (2 * 1.96) == pytest.approx(quantity.uncertainty, rel=0.03)
+    assert quantity.budget["lack of fit"] > 3.0 * quantity.budget["noise"]
+    assert low < film.eps_r < high
 
 
 @pytest.mark.slow

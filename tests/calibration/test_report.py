@@ -7,17 +7,21 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from calibration import figures
 from calibration.curve import Curve
 from calibration.identify import identify
+from calibration.reduction import select
 from calibration.report import write_report
 from calibration.result import Identification
 from calibration.rounding import percent, rounded, stated
-from model.materials import NAMED
+from model.materials import NAMED, Material
 
 Experiment = Callable[..., list[Curve]]
 PARKER = NAMED["parker-cao2018"]
+ONE_TERM = Material(name="one term", mu=(37_834.0,), alpha=(5.4985,), eps_r=1.7)
 ATTACK = "<script>alert(1)</script> & \"'"
 
 
@@ -114,6 +118,47 @@ def test_figures_have_units_and_every_voltage(html: str) -> None:
 def test_what_comes_from_files_is_escaped(html: str) -> None:
     assert "<script" not in html
     assert Page(html).text.count("<script>alert(1)</script> & \"'") >= 4  # label, scene's name, scene, log
+
+
+def pictured(found: Identification, curves: list[Curve]) -> list[tuple[float, float]]:
+    """Of every curve the root mean square of the residuals, in the picture and in the table."""
+    selections = select(curves, found.material, found.wrinkling)
+    pairs = []
+    for curve, selection, row in zip(curves, selections, found.curves, strict=True):
+        _, residual = figures.residual_force(found, curve, selection)
+        pairs.append((float(np.sqrt(np.mean(residual**2))), row.rms_residual))
+    return pairs
+
+
+def test_errors_of_the_rig_that_were_found_have_their_units_and_are_in_the_pictures(
+    tmp_path: Path, experiment: Experiment
+) -> None:
+    """A rig that gives way by 1 mm/N, and force that is 20 ms late at 1 mm/s."""
+    curves = []
+    for curve in experiment(1, samples=400, noise=1e-3, truth=ONE_TERM, guess=ONE_TERM, voltages=(0.0, 1500.0)):
+        assert curve.time is not None
+        late = np.interp(curve.time - 20e-3, curve.time, curve.force)
+        way = curve.h + 1e-3 * late
+        curves.append(replace(curve, h=way, force=late, compliance_uncertainty=1e-3, lag_uncertainty=20e-3))
+    found = identify(curves, terms=1, starts=1)
+    gives, lag = found.nuisance["compliance of the rig"], found.nuisance["lag of run-4mm"]
+    assert abs(gives.value - 1e-3) < 4.0 * gives.uncertainty < 4e-4
+    assert abs(lag.value - 20e-3) < 4.0 * lag.uncertainty < 8e-3
+    for shown, told in pictured(found, curves):
+        assert shown == pytest.approx(told, rel=0.01)
+    path = tmp_path / "report.html"
+    write_report(path, found, curves, scene_texts={}, provenance={})
+    text = Page(path.read_text(encoding="utf-8")).text
+    assert f"{gives.value * 1e6:+.3f} µm/N" in text
+    assert f"{lag.value * 1e3:+.3f} ms" in text
+
+
+def test_pictures_show_what_was_fitted_with_the_tension_field(experiment: Experiment) -> None:
+    curves = experiment(seed=4, samples=600, truth=ONE_TERM, guess=ONE_TERM, prestretch=1.0, highest=14e-3)
+    found = identify(curves, terms=1, starts=1, wrinkling="tension_field")
+    assert sum(curve.wrinkled for curve in found.curves) > 50
+    for shown, told in pictured(found, curves):
+        assert shown == pytest.approx(told, rel=0.01)
 
 
 def test_it_is_the_same_each_time(tmp_path: Path, small: tuple[Identification, list[Curve]]) -> None:

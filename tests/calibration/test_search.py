@@ -177,6 +177,19 @@ def test_the_compliance_of_the_rig_is_fitted_within_its_prior(experiment: Experi
     assert not any("compliance" in suspect.name for suspect in fitted.suspects)
 
 
+def test_a_rig_that_gives_way_far_beyond_its_prior_holds_the_disk_back_by_the_force_there(
+    experiment: Experiment,
+) -> None:
+    """Not by the force where the stage is: at 1 mm/N that is a twentieth more, many times the uncertainty."""
+    curves = experiment(seed=3, samples=1000, noise=3e-4, guess=ONE_TERM, truth=ONE_TERM)
+    soft = [replace(c, h=c.h + 1e-3 * c.force, compliance_uncertainty=3e-4) for c in curves]
+    found = identify(soft, terms=1, starts=1)
+    rig = found.nuisance["compliance of the rig"]
+    assert abs(rig.value - 1e-3) < 3.0 * rig.uncertainty < 6e-5
+    for name, known in (("eps_r", 1.7), ("stiffness", secant_modulus(ONE_TERM, *found.stretch))):
+        assert abs(found.quantities[name].value - known) < 3.0 * found.quantities[name].uncertainty
+
+
 def test_an_eccentric_disk_stiffens_as_two_eccentric_circles_do(experiment: Experiment) -> None:
     """0.04 % for half a millimetre, by the capacitance of eccentric circles; and it is an entry of the budget."""
     curves = experiment(samples=200, guess=ONE_TERM, errors={})
@@ -198,6 +211,17 @@ def test_a_viscous_film_is_named_with_its_size_and_time(
     assert first.amplitude == pytest.approx(0.05, abs=4.0 * first.uncertainty + 0.01)
     assert any("relaxation time near 10 s" in words for words in found.warnings)
     assert found.to_dict()["lack_of_fit"]["suspects"][0]["name"] == first.name
+
+
+def test_a_run_of_one_sample_does_not_keep_the_others_from_showing_a_viscous_film(experiment: Experiment) -> None:
+    curves = experiment(seed=2, samples=200, disks=(4e-3,), voltages=(0.0, 1500.0), guess=ONE_TERM, truth=ONE_TERM)
+    names = [one.name for one in identify(curves, terms=1, starts=1).suspects]
+    assert sum(name.startswith("viscous") for name in names) >= 4
+    first, at = curves[0], slice(80, 81)
+    columns = {name: getattr(first, name)[at] for name in ("h", "force", "voltage", "direction", "time")}
+    single = replace(first, run="single", flagged=None, **columns)
+    found = identify([*curves, single], terms=1, starts=1)
+    assert sorted(one.name for one in found.suspects) == sorted(names)
 
 
 def test_the_covariance_belongs_to_the_uncertainties(experiment: Experiment) -> None:

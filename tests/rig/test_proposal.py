@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from calibration.curve import Curve
+from calibration.identifiability import expected
 from calibration.identify import identify, secant_modulus
 from model.materials import NAMED, Material
 from model.membrane import solve_many
@@ -36,6 +38,22 @@ def half() -> proposal.Proposal:
 @pytest.fixture(scope="module")
 def whole() -> proposal.Proposal:
     return proposal.propose_protocol(SCENE, 600.0, ONE_TERM, terms=1)
+
+
+def test_samples_that_stand_for_many_have_less_noise_of_either_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A force sensor so quiet that the noise of the laser counts: the expected uncertainty stays the same."""
+    scene, _ = load_scene(SCENE)
+    certificates = certificates_of(scene, SCENE.parent)
+    certificates["force"] = replace(certificates["force"], noise=1e-4)
+    film = scene.specimen.specimen().with_material(ONE_TERM)
+    sweep = proposal._sweep(scene, certificates, 300.0, 12e-3, 1500.0)
+    noise = []
+    for most in (10_000, 500):
+        monkeypatch.setattr(proposal, "MOST_SAMPLES", most)
+        curves = proposal.recorded(sweep, scene, certificates, film)
+        assert curves[0].h.size <= most
+        noise.append(expected(curves, ONE_TERM).quantities["eps_r"].budget["noise"])
+    assert noise[1] == pytest.approx(noise[0], rel=0.1)
 
 
 @pytest.mark.slow

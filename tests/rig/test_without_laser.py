@@ -1,5 +1,6 @@
 """Where the stage stands for the displacement: what is not known of the rig is fitted along, nothing else is blamed."""
 
+import re
 from importlib.resources import files
 from pathlib import Path
 
@@ -11,6 +12,45 @@ from rig.identification import UNKNOWN_LAG, identify_logs
 
 FIXTURES = Path(str(files("sim_fixtures")))
 RUNS = 12
+PROTOCOL = """title = "Up and down"
+[[step]]
+do = "home"
+[[step]]
+do = "zero"
+duration_s = 1.0
+[[step]]
+do = "approach"
+speed_mm_per_s = 0.5
+threshold_mN = 10.0
+max_travel_mm = 10.0
+[[step]]
+do = "sweep"
+displacement_mm = 8.0
+speed_mm_per_s = 4.0
+voltages_V = [0, 1000]
+settle_s = 0.5
+[[step]]
+do = "return"
+speed_mm_per_s = 2.0
+"""
+
+
+def test_sensors_without_certificate_are_told_and_a_laser_still_measures_the_disk(tmp_path: Path) -> None:
+    text = (FIXTURES / "scenes" / "cone-4mm.toml").read_text(encoding="utf-8")
+    text = text.replace("../calibrations", (FIXTURES / "calibrations").as_posix())
+    protocol, scene, out = (tmp_path / name for name in ("protocol.toml", "scene.toml", "out.mcap"))
+    protocol.write_text(PROTOCOL, encoding="utf-8")
+    text, count = re.subn(r"certificate = .*(displacement|hv).toml.*\n", "", text)
+    assert count == 2
+    scene.write_text(text, encoding="utf-8")
+    run(prepare(scene, protocol), out, lambda done, total, label: None)
+    found = identify_logs([out], terms=1)
+    assert not any("compliance" in name for name in found.identification.nuisance)
+    for note, device in zip(found.notes, ("displacement", "hv"), strict=True):
+        assert "has no certificate" in note
+        assert f"dea-rig calibrate {device}" in note
+    (certified,) = (FIXTURES / "logs" / "paper").glob("*.mcap")
+    assert identify_logs([certified], terms=1).notes == []
 
 
 @pytest.mark.slow
