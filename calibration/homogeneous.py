@@ -138,6 +138,12 @@ def load_test(path: Path) -> HomogeneousTest:
     table = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
     if len(table) < 3:
         raise TestsError(f"{path}: a heading and at least two rows are needed, there are {len(table)} rows")
+    for line, row in enumerate(table[1:], start=1):
+        if len(row) != len(table[0]):
+            raise TestsError(
+                f"{path}: row {line} below the heading has {len(row)} values and the heading {len(table[0])}; values "
+                "are separated by commas, and decimals have a point"
+            )
     columns = _columns(path, [cell.strip() for cell in table[0]], table[1:])
     if kind == "biaxial":
         stretch1, stretch2 = columns["stretch1"], columns["stretch2"]
@@ -161,7 +167,7 @@ def _kind(path: Path, remarks: Sequence[str]) -> str:
         if kind in name:
             return kind
     raise TestsError(
-        f"{path}: what kind of test is it? Write '# kind: uniaxial' (or {', '.join(KINDS)}) above the heading"
+        f"{path}: what kind of test is it? Write '# kind: KIND' the heading, with one of {', '.join(KINDS)}"
     )
 
 
@@ -180,7 +186,10 @@ def _columns(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) 
         except (ValueError, IndexError) as error:
             raise TestsError(f"{path}: column {title!r} holds something that is not a number: {error}") from error
         if not np.isfinite(column).all():
-            raise TestsError(f"{path}: column {title!r} holds a value that is not finite")
+            raise TestsError(
+                f"{path}: column {title!r} holds a value that is not finite, in row "
+                f"{int(np.flatnonzero(~np.isfinite(column))[0]) + 1} below the heading"
+            )
         if title.startswith("stretch") and not (column > 0.0).all():
             raise TestsError(
                 f"{path}: column {title!r} holds a stretch that is not positive; 1 is the unstretched sheet"
@@ -190,7 +199,7 @@ def _columns(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) 
     if set(columns) not in (single, double):
         raise TestsError(
             f"{path}: the columns are {', '.join(heading)}; wanted are stretch, nominal_stress_MPa, or for biaxial "
-            "tests stretch1, stretch2, nominal_stress1_MPa, nominal_stress2_MPa"
+            "tests stretch1, stretch2, nominal_stress1_MPa, nominal_stress2_MPa, separated by commas"
         )
     return columns
 
@@ -286,8 +295,11 @@ class _TestsProblem:
         self.terms = terms
         self.measured = np.concatenate([test.measured for test in tests])
         size = np.abs(self.measured)
-        if not size.max() > 0.0:
-            raise TestsError("all stresses are zero")
+        for test in tests:
+            if not np.ptp(test.measured) > 0.0:
+                raise TestsError(
+                    f"{test.name}: all stresses are {test.measured[0]:g} Pa; nothing can be fitted to that"
+                )
         if weighting == "relative":
             self.weight = 1.0 / np.maximum(size, 0.01 * size.max())
         else:
@@ -297,7 +309,8 @@ class _TestsProblem:
         unit, *_ = self._model(np.array([1.0]), np.array([2.0]))
         scale = float((self.weight**2 * self.measured) @ unit / ((self.weight**2 * unit) @ unit))
         if not scale > 0.0:
-            raise TestsError("the stresses do not rise with the stretch; is tension positive?")
+            names = ", ".join(test.name for test in tests)
+            raise TestsError(f"{names}: the stresses do not rise with the stretch; tension has to be positive")
         self.scale = scale
 
     def _model(self, mu: Array, alpha: Array) -> tuple[Array, Array, Array]:

@@ -72,7 +72,7 @@ def minimise_many(
         gain = np.where(there.answered, cost[k] - there.cost, -np.inf)
         better = gain > 0.0
         won, lost = k[better], k[~better]
-        share = np.clip(gain[better] / np.maximum(promised[better], 1e-300), -1.0, 2.0)
+        share = np.clip(gain[better] / np.maximum(promised[better], 1e-30), -1.0, 2.0)
         slow[won] = np.where(gain[better] < decrease, slow[won] + 1, 0)
         x[won], cost[won] = trial[better], there.cost[better]
         residual[won], jacobian[won] = there.residual[better], there.jacobian[better]

@@ -177,9 +177,15 @@ def proposal_table(found: Proposal) -> Group:
         values = (design[name] for design in (found.planned.combined, found.sweep.combined))
         noise = (design[name] for design in (found.planned.random, found.sweep.random))
         table.add_row(_NAMES.get(name, name), *(f"{100 * value:.2g}" for value in (*values, *noise)))
+    worse = (
+        ["For this film the uniform sweep is expected to tell more than these holds; a sweep is the better protocol."]
+        if found.gain < 1.0
+        else []
+    )
     return Group(
         route,
         table,
+        *worse,
         f"planned {_minutes(found.planned.duration)}, sweep {_minutes(found.sweep.duration)}, homing to return. The "
         f"sweep would have to record {found.gain:.2g} times as long for the same noise; gains and dimensions gain "
         "nothing by time. What is best depends on the film: after a first run plan with its result (--fit).",
@@ -264,10 +270,15 @@ def tests_table(found: TestsFit) -> Group:
     explained.add_column("fitted", justify="right")
     explained.add_column("predicted", justify="right")
     for name, share in found.r_squared.items():
-        explained.add_row(name, f"{share:.5f}", "")
+        explained.add_row(name, _share(share), "")
     for name, share in found.prediction.items():
-        explained.add_row(name, "", f"{share:.5f}")
+        explained.add_row(name, "", _share(share))
     return Group(table, explained, *(f"note: {warning}" for warning in found.warnings))
+
+
+def _share(share: float) -> str:
+    """R^2 as text; far below zero, where any constant does better, its digits mean nothing."""
+    return f"{share:.5f}" if share >= -10.0 else "< -10"
 
 
 def truth_table(found: Found) -> RenderableType:

@@ -73,10 +73,10 @@ def _compliance(scene: Scene) -> list[str]:
 
 def _hv(scene: Scene) -> list[str]:
     # Whole volts, as near to the limit as they go: a run may not ask for more than was calibrated.
-    step = math.floor(PART * (scene.limits.voltage_V or 0.0) / LEVELS)
-    if not step > 0:
+    top = math.floor(PART * (scene.limits.voltage_V or 0.0))
+    if not top >= LEVELS:
         raise ConfigError("limits.voltage_V is missing or too low; there is no voltage to calibrate at.")
-    return [*_zero(), *_mount("none"), *_meter([float(k * step) for k in range(LEVELS + 1)])]
+    return [*_zero(), *_mount("none"), *_meter([float(round(k * top / LEVELS)) for k in range(LEVELS + 1)])]
 
 
 def _timing(scene: Scene) -> list[str]:

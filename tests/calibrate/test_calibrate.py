@@ -1,6 +1,7 @@
 """One calibration of every kind on the simulated bench: certificate, evidence, replay from its log, daily check."""
 
 import io
+import math
 import re
 import tomllib
 from datetime import date
@@ -22,6 +23,7 @@ from rig.errors import DataError, LimitError
 from rig.identification import identify_logs
 from rig.log.reader import read_log
 from rig.plan import check_plan, plan
+from rig.proposal import MARGIN
 from rig.protocol import Protocol
 from rig.scene import load_scene
 from rig.tables import calibration_table
@@ -281,3 +283,4 @@ def test_the_usual_calibration_of_the_voltage_reaches_what_runs_ask_for():
     asked = load_table(FIXTURES / "protocols" / "paper.toml", Protocol, "protocol")[0]
     reach = max(max(step.voltages_V) for step in steps.step if step.do == "meter")
     assert max(max(step.voltages_V) for step in asked.step if step.do == "sweep") <= reach <= scene.limits.voltage_V
+    assert reach >= math.floor(MARGIN * scene.limits.voltage_V)  # what `dea-rig plan` goes up to

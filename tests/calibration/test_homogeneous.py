@@ -145,7 +145,8 @@ def test_kind_is_read_from_the_published_files(treloar: list[HomogeneousTest], k
         ("uniaxial", "torsion", "allowed are"),
         ("_kPa", "", "no unit"),
         ("_kPa", "_psi", "no unit"),
-        ("1.2,40", "1.2", "not a number"),
+        ("1.2,40", "1.2", "has 1 values and the heading 2"),
+        ("1.2,40", "1,2,40,0", "decimals have a point"),
         ("1.2,40", "1.2,forty", "not a number"),
         ("1.2,40", "1.2,nan", "not finite"),
         ("1.2,40", "-1.2,40", "not positive"),
@@ -176,3 +177,18 @@ def test_too_few_data_are_refused(tmp_path: Path) -> None:
     path.write_text(GOOD)
     with pytest.raises(TestsError, match="cannot determine"):
         fit_tests([load_test(path)], terms=2)
+
+
+def test_stresses_that_nothing_can_be_fitted_to_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "flat.csv"
+    rows = [1.1, 1.2, 1.3, 1.4, 1.5]
+    for stresses, words in (
+        ([7.0] * 5, "all stresses are 7000 Pa"),
+        ([-k for k in rows], "tension has to be positive"),
+    ):
+        path.write_text(
+            "# kind: uniaxial\nstretch,nominal_stress_kPa\n"
+            + "".join(f"{stretch},{stress}\n" for stretch, stress in zip(rows, stresses, strict=True))
+        )
+        with pytest.raises(TestsError, match=f"flat: .*{words}"):
+            fit_tests([load_test(path)], terms=1)

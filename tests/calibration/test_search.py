@@ -3,11 +3,14 @@
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from calibration import problem as problem_module
+from calibration import search
 from calibration.curve import Curve
 from calibration.identify import compare, identify, secant_modulus
 from calibration.problem import NODES, Problem
@@ -231,3 +234,24 @@ def test_the_covariance_belongs_to_the_uncertainties(experiment: Experiment) -> 
         assert found.covariance[k][k] ** 0.5 == pytest.approx(quantity.uncertainty, rel=1e-6)
     assert np.allclose(found.covariance, np.transpose(found.covariance))
     assert found.to_dict()["covariance"] == found.covariance
+
+
+def test_a_step_that_promised_nothing_does_not_overflow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the edge of the allowed range a step is cut short; it may gain although the linear model promises nothing."""
+
+    class Steep:
+        def evaluate(self, x: Any) -> Any:
+            residual = 1e6 * (x - 1.0)
+            jacobian = np.full((*x.shape, 1), 1e6)
+            answered = np.ones(len(x), dtype=bool)
+            return SimpleNamespace(residual=residual, jacobian=jacobian, answered=answered, cost=(residual**2).sum(1))
+
+    def humble(x: Any, *rest: Any) -> tuple[Any, Any, Any]:
+        return 0.5 * (1.0 - x), np.zeros(len(x)), np.ones_like(x)
+
+    monkeypatch.setattr(search, "_step", humble)
+    everywhere = np.full((1, 1), -1e9), np.full((1, 1), 1e9)
+    steep: Any = Steep()
+    (found,) = minimise_many(steep, np.zeros((1, 1)), everywhere, np.ones(1, dtype=bool))
+    assert found is not None
+    assert found.x[0] > 0.4

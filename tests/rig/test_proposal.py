@@ -23,6 +23,7 @@ from rig.experiment import certificates_of, prepare, run
 from rig.identification import identify_logs
 from rig.protocol import Protocol, load_protocol
 from rig.scene import load_scene
+from rig.tables import proposal_table
 
 FIXTURES = Path(__file__).resolve().parents[2] / "sim_fixtures"
 SCENE = FIXTURES / "scenes" / "cone-4mm.toml"
@@ -209,3 +210,11 @@ def test_a_planned_run_on_the_simulated_bench_is_identified(tmp_path: Path) -> N
         quantity = found.quantities[name]
         assert abs(quantity.value - known) < 3.0 * quantity.uncertainty, name
         assert quantity.relative < 2.0 * planned.planned.combined[name]
+
+
+def test_holds_that_tell_less_than_the_sweep_are_not_praised(half: proposal.Proposal) -> None:
+    def told(found: proposal.Proposal) -> bool:
+        return "sweep is the better protocol" in " ".join(map(str, proposal_table(found).renderables))
+
+    assert not told(half)
+    assert told(replace(half, planned=half.sweep, sweep=half.planned))
