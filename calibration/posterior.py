@@ -5,7 +5,8 @@ twice as fast in the long valleys of Ogden terms) sample
 
 .. math:: \ln p(x) = -\tfrac{1}{2} \chi^2(x) + \text{const}
 
-with the same residuals, the same Gaussian priors of the nuisances and the same bounds as the fit, flat inside them.
+with the same residuals, the same Gaussian priors of the nuisances and the same bounds as the fit, flat inside them;
+what was held in the fit is held here.
 Gains and the specimen's dimensions are not sampled: what they add stands in the budget of the fit.
 """
 
@@ -124,33 +125,41 @@ def posterior(
     compliance = 0.0 if rig is None else rig.value
     problem = Problem(curves, selections, found.terms, found.material, wrinkling=found.wrinkling, compliance=compliance)
     best = problem.vector(found.material)
-    low, high = problem.bounds(best)
+    held = found.provenance.get("settings", {}).get("fixed", {})
+    free = np.array([name not in held for name in problem.names])
+    low, high = (side[free] for side in problem.bounds(best))
     rng = np.random.default_rng(seed)
-    walkers = WALKERS * best.size
+    size = int(free.sum())
+    walkers = WALKERS * size
+
+    def whole(points: Array) -> Array:
+        full = np.tile(best, (len(points), 1))
+        full[:, free] = points
+        return full
 
     def log_probability(points: Array) -> Array:
         inside = ((points > low) & (points < high)).all(axis=1)
         values = np.full(len(points), -np.inf)
         if inside.any():
-            there = problem.evaluate(points[inside], slopes=False)
+            there = problem.evaluate(whole(points[inside]), slopes=False)
             values[inside] = np.where(there.answered, -0.5 * there.cost, -np.inf)
         return values
 
-    begin = _around(problem, best, low, high, walkers, rng)
+    begin = _around(problem.jacobian(best)[:, free], best[free], low, high, walkers, rng)
     moves = [(emcee.moves.DEMove(), 0.5), (emcee.moves.StretchMove(), 0.5)]
-    sampler = emcee.EnsembleSampler(walkers, best.size, log_probability, moves=moves, vectorize=True)
+    sampler = emcee.EnsembleSampler(walkers, size, log_probability, moves=moves, vectorize=True)
     sampler.random_state = np.random.RandomState(seed).get_state()
     state, done, longest = begin, 0, math.inf
     while done < min(steps, ENOUGH * longest):
         state = sampler.run_mcmc(state, min(LOOK, steps - done))
         done = sampler.iteration
-        times = np.asarray(sampler.get_autocorr_time(tol=0, quiet=True))[: problem.film_parameters]
+        times = np.asarray(sampler.get_autocorr_time(tol=0, quiet=True))[: free[: problem.film_parameters].sum()]
         longest = float(times.max()) if np.isfinite(times).all() else math.inf
         progress(done, max(done, min(steps, ENOUGH * longest)), f"{done} steps, autocorrelation {longest:.0f}")
     chain = sampler.get_chain(discard=done // 3, flat=True)
     kept = chain[rng.choice(len(chain), size=min(KEPT, len(chain)), replace=False)]
     return Posterior(
-        quantities=_quantities(problem, kept, found),
+        quantities=_quantities(problem, whole(kept), found),
         steps=done,
         walkers=walkers,
         acceptance=float(np.mean(sampler.acceptance_fraction)),
@@ -159,9 +168,8 @@ def posterior(
     )
 
 
-def _around(problem: Problem, best: Array, low: Array, high: Array, walkers: int, rng: np.random.Generator) -> Array:
+def _around(jacobian: Array, best: Array, low: Array, high: Array, walkers: int, rng: np.random.Generator) -> Array:
     """Where the walkers begin: about the best fit, by its curvature, well inside the bounds."""
-    jacobian = problem.jacobian(best)
     scale = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-12)))
     room = np.where(np.isfinite(high - low), 0.02 * (high - low), np.inf)
     points = best + np.minimum(scale, room) * rng.standard_normal((walkers, best.size))

@@ -35,6 +35,19 @@ def test_a_chain_that_is_too_short_says_so(experiment):
     assert not posterior(curves, identify(curves, terms=1), steps=60).converged
 
 
+@pytest.mark.slow
+def test_what_the_fit_held_is_held(experiment):
+    """A given exponent leaves the modulus several times less uncertain than one that may follow it."""
+    curves = experiment(1, samples=200, disks=(4e-3,), voltages=(0.0, 1500.0))
+    found = identify(curves, terms=1, fixed={"alpha1": 5.4985})
+    chains = posterior(curves, found, steps=400)
+    assert "alpha1" not in chains.quantities
+    for name in ("mu1", "G", "eps_r"):
+        budget = found.quantities[name].budget
+        fitted = [budget[part] for part in ("noise", "force zero", "displacement zero")]
+        assert chains.quantities[name].deviation == pytest.approx(float(np.linalg.norm(fitted)), rel=0.3), name
+
+
 def test_emcee_is_imported_only_when_asked_for():
     code = "import sys, calibration.posterior, rig.identification; sys.exit('emcee' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
