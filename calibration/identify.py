@@ -562,8 +562,8 @@ def _warnings(result: Identification, problem: Problem, fit: _Fit) -> list[str]:
             f"neighbouring samples are correlated: {result.used} samples count as "
             f"{result.used / result.samples_per_independent:.0f} independent ones"
         )
-    for curve, measured in zip(result.curves, problem.curves, strict=True):
-        words += _curve_warnings(curve, measured.direction, result.samples_per_independent)
+    for curve, measured, selection in zip(result.curves, problem.curves, problem.selections, strict=True):
+        words += _curve_warnings(curve, measured.direction[selection.used], result.samples_per_independent)
     for name, zero in result.nuisance.items():
         if abs(zero.value) > 3.0 * zero.prior:
             words.append(
@@ -580,6 +580,7 @@ def _share(relative: float) -> str:
 
 
 def _curve_warnings(curve: CurveResult, direction: NDArray[np.int8], per_independent: float) -> list[str]:
+    """What is to be said of one curve; ``direction`` is that of its used samples."""
     words = []
     if curve.samples - curve.used > curve.excluded.get("before contact", 0):
         reasons = ", ".join(f"{count} {reason}" for reason, count in curve.excluded.items())

@@ -236,6 +236,15 @@ def test_hysteresis_is_reported_as_lack_of_fit(experiment: Experiment) -> None:
         assert curve.mean_residual_loading > curve.mean_residual_unloading
 
 
+def test_a_few_loading_samples_are_no_hysteresis(experiment: Experiment) -> None:
+    """The mean of the twenty that are left scatters by more than that of the thousand that were taken."""
+    flagged = np.repeat([True, False], [980, 1020])
+    for seed in range(6):
+        curves = experiment(seed, samples=2000, disks=(4e-3,), voltages=(0.0, 1500.0), truth=ONE_TERM, guess=ONE_TERM)
+        found = identify([replace(curve, flagged=flagged) for curve in curves], terms=1, starts=1)
+        assert not any("hysteresis" in warning for warning in found.warnings)
+
+
 def test_what_is_advised_against_unseen_imperfections_rules_them_out(experiment: Experiment) -> None:
     """The first curve once more at the end tells softening from a permittivity; a hold tells a viscous film."""
     options: dict[str, Any] = {"samples": 200, "disks": (4e-3,), "truth": ONE_TERM, "guess": ONE_TERM}
