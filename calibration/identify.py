@@ -1,11 +1,12 @@
 """Ogden parameters and permittivity of a film from its force-displacement curves, with uncertainties to be believed.
 
 All curves, voltages and specimens are fitted at once. The film's parameters enter as stiffness shares ``g_n = mu_n
-alpha_n / (2 G_0) > 0`` and exponents ``alpha_n``, all of order one, with ``eps_r`` where there is voltage. The zeros
-of force and displacement and the lag of the force of each run, and the rig's compliance, are nuisance parameters whose
-prior is their stated uncertainty. Gains and the specimen's dimensions are not fitted, because the data must not be
-allowed to excuse a wrong model with a wrong gain: their uncertainties are propagated linearly (JCGM 100:2008, 5.1) and
-stated apart.
+alpha_n / (2 G_0) > 0`` and exponents ``alpha_n``, all of order one, with ``eps_r`` where there is voltage. Exponents
+stay between 0.2 and 30; one that the data do not determine counts as anywhere in between. The zeros of force and
+displacement and the lag of the force of each run, and the rig's compliance, are nuisance parameters whose prior is
+their stated uncertainty. Gains and the specimen's dimensions are not fitted, because the data must not be allowed to
+excuse a wrong model with a wrong gain: their uncertainties are propagated linearly (JCGM 100:2008, 5.1) and stated
+apart.
 
 Convention of the Ogden terms: `model.materials.Material`.
 """
@@ -400,7 +401,7 @@ def _assemble(
     misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
     rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits]
     doubts = suspects(problem, x, determined(problem, fit.at_bound, held))
-    stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals, doubts=doubts)
+    stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals, doubts=doubts, ranges=True)
     quantities = stated.quantities
     if profiles or fit.at_bound[: problem.terms].any():  # where a term has vanished, curvature says nothing of it
         aims = targets(problem, stated.stretch, held)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.curve import Curve
 from calibration.misfit import Suspect
-from calibration.problem import Problem
+from calibration.problem import EXPONENT_BOUNDS, Problem
 from calibration.result import Quantity, Stiffness, Zero, verdict
 from model.materials import Material
 
@@ -29,12 +29,11 @@ SYSTEMATIC = (
 )
 
 
-NUISANCES = {
-    "force_zero": "N",
-    "displacement_zero": "m",
-    "lag": "s",
-    "compliance": "m/N",
-}  # what is fitted along, and its unit
+# What is fitted along, and its unit.
+NUISANCES = {"force_zero": "N", "displacement_zero": "m", "lag": "s", "compliance": "m/N"}
+# Standard deviation of an exponent of which no more is known than its range (rectangular: JCGM 100:2008, 4.3.7).
+RANGE = (EXPONENT_BOUNDS[1] - EXPONENT_BOUNDS[0]) / math.sqrt(12.0)
+NEGLIGIBLE = 1e-3  # of the noise: what is less has no line in a budget
 
 
 def stiffening(curve: Curve) -> float:
@@ -110,6 +109,8 @@ class Propagation:
 
     ``misfit`` is the chi-square of the lack of fit over its expectation; ``rivals`` are other minima with their
     likelihood relative to this one; ``doubts`` are imperfections, of which the first biases the result if it is there.
+    With ``ranges`` it counts as knowledge that exponents lie in their range. Of an exponent that the data do not
+    determine the curvature says far more than is possible, and with it of all that is derived from it.
     """
 
     def __init__(
@@ -120,16 +121,21 @@ class Propagation:
         misfit: float,
         rivals: Sequence[tuple[Material, float]],
         doubts: Sequence[Suspect],
+        *,
+        ranges: bool = False,
     ) -> None:
         self.problem = problem
         self.film = problem.film(x)
-        self.covariance = Covariance(problem.jacobian(x), free)
+        jacobian = problem.jacobian(x)
+        known = np.eye(problem.terms, x.size, problem.terms) / RANGE if ranges else np.empty((0, x.size))
+        self.covariance = Covariance(np.concatenate((jacobian, known)), free)
+        self.response = self.covariance.response[:, : len(jacobian)]
         self.misfit = misfit
         self.doubts = doubts
         self.bias: Array | None = None
         for guilty in doubts[:1]:
             if guilty.significant:
-                self.bias = self.covariance.response @ (guilty.amplitude * guilty.shape)
+                self.bias = self.response @ (guilty.amplitude * guilty.shape)
         self.rivals = rivals
         self.effects: dict[str, Array] = {}
         states = problem.states(x)
@@ -137,11 +143,11 @@ class Propagation:
             relative = np.array([getattr(problem.curves[i], uncertainty) for i in problem.active])[:, None]
             if relative.any():
                 change = states.force if scales == "force" else states.by[scales] * self._size(scales)
-                self.effects[part] = self.covariance.response @ problem.project((relative * change)[..., None])[:, 0]
+                self.effects[part] = self.response @ problem.project((relative * change)[..., None])[:, 0]
         tilted = np.array([stiffening(problem.curves[i]) for i in problem.active])[:, None]
         if tilted.any():
             shift = problem.project((tilted * states.force)[..., None])[:, 0]
-            self.effects["eccentricity"] = self.covariance.response @ shift
+            self.effects["eccentricity"] = self.response @ shift
 
     def _size(self, name: str) -> Array:
         """Displacement, voltage or a dimension of the specimen at the nodes of every active curve."""
@@ -169,7 +175,7 @@ class Propagation:
     def unseen(self, gradients: Mapping[str, Array]) -> dict[str, dict[str, float]]:
         """By how much each imperfection may shift functions of x before it would be reported."""
         # The shape is what it would do to the model; the data have it and the model has not.
-        shifts = {one.name: self.covariance.response @ (-one.shows_from * one.shape) for one in self.doubts}
+        shifts = {one.name: self.response @ (-one.shows_from * one.shape) for one in self.doubts}
         return {
             doubt: {name: float(gradient @ shift) for name, gradient in gradients.items()}
             for doubt, shift in shifts.items()
@@ -192,6 +198,9 @@ class Propagation:
             mine = [data + k for k, nuisance in enumerate(self.problem.nuisances) if nuisance.kind == kind]
             if mine:
                 parts[kind.replace("_", " ")] = float(np.linalg.norm(rows[mine]))
+        unknown = float(np.linalg.norm(rows[self.response.shape[1] :]))
+        if unknown > NEGLIGIBLE * parts["noise"]:
+            parts["range of exponents"] = unknown
         bias = 0.0 if self.bias is None else float(gradient @ self.bias)
         if self.misfit > 1.0 or self.bias is not None:
             parts["lack of fit"] = math.hypot(parts["noise"] * math.sqrt(max(0.0, self.misfit - 1.0)), bias)
@@ -233,16 +242,20 @@ def state(
     misfit: float = 1.0,
     rivals: Sequence[tuple[Material, float]] = (),
     doubts: Sequence[Suspect] = (),
+    ranges: bool = False,
 ) -> Statement:
     """Quantities with uncertainties at ``x``; ``at_bound`` marks entries of x, ``held`` names those that were given.
 
     ``doubts`` are the imperfections that the residuals were held against (`calibration.misfit`), most probable first.
-    If that one was found, what it does to the results is part of their uncertainty.
+    If that one was found, what it does to the results is part of their uncertainty. With ``ranges`` the shear modulus
+    and the permittivity count on exponents being in their range. The terms, and the stiffness at stretches that were
+    reached, stand as the data alone have them.
     """
     n = problem.terms
     vanished = at_bound[:n]
     free = determined(problem, at_bound, held)
     propagation = Propagation(problem, x, free, misfit, rivals, doubts)
+    derived = Propagation(problem, x, free, misfit, rivals, doubts, ranges=True) if ranges else propagation
     film = propagation.film
     mu, alpha = np.array(film.mu), np.array(film.alpha)
     zero, unit = np.zeros(n), np.eye(n)
@@ -268,7 +281,7 @@ def state(
                 at_bound=bool(vanished[k] or at_bound[n + k]),
                 known=not vanished[k],
             )
-    quantities["G"] = propagation.quantity(lambda m: m.shear_modulus, gradient(alpha / 2.0, mu / 2.0), "Pa")
+    quantities["G"] = derived.quantity(lambda m: m.shear_modulus, gradient(alpha / 2.0, mu / 2.0), "Pa")
 
     hoop = float(np.mean([problem.curves[i].specimen.prestretch for i in problem.active]))
     longest = max(float(problem.states(x).max_stretch.max()), hoop + 0.02)
@@ -283,9 +296,7 @@ def state(
     quantities["stiffness_end"] = along[-1]
     if problem.electric and "eps_r" not in held:
         slopes["eps_r"] = gradient(zero, zero, 1.0)
-        quantities["eps_r"] = propagation.quantity(
-            lambda m: m.eps_r, slopes["eps_r"], "1", at_bound=bool(at_bound[2 * n])
-        )
+        quantities["eps_r"] = derived.quantity(lambda m: m.eps_r, slopes["eps_r"], "1", at_bound=bool(at_bound[2 * n]))
 
     told = {"stiffness": gradient(by_mu[at], by_alpha[at]), **({"eps_r": slopes["eps_r"]} if "eps_r" in slopes else {})}
 
@@ -318,7 +329,7 @@ def state(
         correlation=_correlation(np.array(list(slopes.values())), propagation.covariance.matrix),
         covariance=propagation.covariances(np.array(list(slopes.values()))).tolist(),
         condition=_condition(problem, x, free),
-        unseen=propagation.unseen(told),
+        unseen=derived.unseen(told),
     )
 
 

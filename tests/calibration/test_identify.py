@@ -66,6 +66,13 @@ def test_the_two_term_set_is_called_not_identifiable(paper: Identification) -> N
     assert any("would bring" in words for words in paper.advice)
 
 
+def test_exponents_that_are_not_determined_count_as_within_their_range(paper: Identification) -> None:
+    """For what follows from them; they themselves, and the stiffness, stand as the data alone have them."""
+    part = "range of exponents"
+    assert paper.quantities["eps_r"].budget[part] > 0.0 and paper.quantities["G"].budget[part] > 0.0
+    assert not any(part in paper.quantities[name].budget for name in ("mu1", "alpha1", "stiffness"))
+
+
 def test_right_model_and_right_noise_give_a_chi_square_of_one(paper: Identification) -> None:
     assert paper.reduced_chi_square == pytest.approx(1.0, abs=4 * math.sqrt(2 / paper.freedom))
     assert paper.lack_of_fit_probability > 1e-3
