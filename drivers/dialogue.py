@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from drivers.link import ByteLink, DeviceSilent, FrameLink
+from drivers.links.link import ByteLink, DeviceSilent, FrameLink
 
 Q = TypeVar("Q")
 R = TypeVar("R")

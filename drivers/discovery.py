@@ -19,10 +19,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar
 
-from drivers import cia404, gsv8, iseg_edcp, keyence_lkg, shvps, zaber
-from drivers.can_link import INTERFACES
+from drivers.instruments import cia404, gsv8, iseg_edcp, keyence_lkg, shvps, zaber
 from drivers.lines import LineSplitter
-from drivers.link import ByteLink, CanFrame, DeviceError, FrameLink
+from drivers.links.can_link import INTERFACES
+from drivers.links.link import ByteLink, CanFrame, DeviceError, FrameLink
 from drivers.roles import Identity
 
 M = TypeVar("M")
@@ -122,11 +122,11 @@ def discover(
     """
     found: list[Found] = []
     if ports is None:
-        from drivers.serial_link import ports as existing_ports
+        from drivers.links.serial_link import ports as existing_ports
 
         ports = existing_ports()
     if buses is None:
-        from drivers.can_link import channels
+        from drivers.links.can_link import channels
 
         known = [Bus(interface, channel) for interface, channel in channels()]
         buses = [bus for bus in known if bus.interface == "socketcan"]
@@ -142,13 +142,13 @@ def discover(
 
 
 def _open_port(port: str, baud: int) -> ByteLink:
-    from drivers.serial_link import SerialLink
+    from drivers.links.serial_link import SerialLink
 
     return SerialLink("devices", port, baud)
 
 
 def _open_bus(bus: Bus) -> FrameLink:
-    from drivers.can_link import CanLink
+    from drivers.links.can_link import CanLink
 
     return CanLink("devices", *bus)
 

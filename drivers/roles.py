@@ -2,7 +2,7 @@
 
 A driver is polled: ``poll(now)`` reads what has arrived, sends what is due, and returns the new samples. It never
 blocks and never asks the time itself. After construction a driver first runs its set-up dialogue; ``ready`` is True
-when that has ended. It raises a `drivers.link.DeviceError` when the operator must act. Corrupted input is dropped
+when that has ended. It raises a `drivers.links.link.DeviceError` when the operator must act. Corrupted input is dropped
 and counted in ``counters``, never returned as a sample.
 
 SI units throughout: metres, newtons, volts, amperes, seconds.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drivers.link import DeviceRefused, DeviceSilent
+from drivers.links.link import DeviceRefused, DeviceSilent
 from drivers.roles import ForceSample
 from drivers.sample_clock import SampleClock
 

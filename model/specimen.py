@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from model.materials import Material
+from model.material.materials import Material
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 """``python -m rig`` is ``dea-rig``."""
 
-from rig.cli import main
+from rig.cli.app import main
 
 main(prog_name="dea-rig")

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.roles import DisplacementSample, ForceSample, HVFlag, Sample, Stage, StageSample
+from rig.base.errors import FaultError, LimitError
 from rig.calibrate.steps import CALIBRATION
-from rig.control import Question
-from rig.errors import FaultError, LimitError
-from rig.plan import Action
+from rig.engine.watch import check_zero
+from rig.operator.control import Question
+from rig.protocol.plan import Action
 from rig.safety.guard import SAFE_VOLTAGE, TRIP, GuardState, flag_names
-from rig.watch import check_zero
 
 if TYPE_CHECKING:
-    from rig.engine import Engine
+    from rig.engine.engine import Engine
 
 Turns = Generator[None, None, None]
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import click
 
-from rig.errors import ConfigError
+from rig.analysis.film import identify_logs, write_results
+from rig.base.errors import ConfigError
+from rig.base.progress import progress
+from rig.cli.show import identification_table, show, truth_table
 from rig.experiment import prepare
 from rig.experiment import run as run_experiment
-from rig.identification import identify_logs, write_results
-from rig.progress import progress
-from rig.tables import identification_table, show, truth_table
 
 SCENES = ("cone-4mm", "cone-6mm")
 PROTOCOL = "paper"

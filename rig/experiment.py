@@ -13,22 +13,22 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-from calibration.certificate import Certificate, CertificateError, load_certificate
-from rig.bench import Bench
+from calibration.sensors.certificate import Certificate, CertificateError, load_certificate
+from rig.base.clock import Clock, calendar_now
+from rig.base.errors import ConfigError, FaultError, LimitError
+from rig.bench.bench import Bench
 from rig.calibrate.steps import CALIBRATION
-from rig.clock import Clock, calendar_now
-from rig.control import Control, Keyboard, Source
-from rig.engine import Engine, Outcome
-from rig.errors import ConfigError, FaultError, LimitError
+from rig.engine.engine import Engine, Outcome
 from rig.log import space
 from rig.log.process import LogProcess
+from rig.log.recorder import Gains
 from rig.log.writer import LogWriter
-from rig.plan import Action, Prediction, check_plan, plan
-from rig.protocol import Protocol, load_protocol
-from rig.recorder import Gains
+from rig.operator.control import Control, Keyboard, Source
+from rig.operator.signals import stop_on_signals
+from rig.protocol.plan import Action, Prediction, check_plan, plan
+from rig.protocol.protocol import Protocol, load_protocol
 from rig.safety.guard import ADVICE
-from rig.scene import Scene, load_scene
-from rig.signals import stop_on_signals
+from rig.scene.scene import Scene, load_scene
 
 # In a log's metadata: on what bench it was. In memory its truth is that of its own scene.
 IN_MEMORY, ON_PORTS = "simulated in memory", "real ports"
@@ -111,7 +111,7 @@ def run(
 
     Raises
     ------
-    RigError, drivers.link.DeviceError
+    RigError, drivers.links.link.DeviceError
         What ended the run early; the rig has been made safe and the log finished by then, and the error carries the
         outcome as a note.
     """
@@ -165,7 +165,7 @@ def run(
 
 
 def _sources(out: Path) -> list[Source]:
-    from rig.remote import Remote
+    from rig.operator.remote import Remote
 
     keyboard = Keyboard.here()
     return [Remote(out.resolve()), *([keyboard] if keyboard is not None else [])]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.materials import NAMED, Material
-from model.reference import Reference, reference
+from model.material.materials import NAMED, Material
 from model.specimen import Specimen
+from model.verification.reference import Reference, reference
 
 Generator = np.random.Generator
 

@@ -2,7 +2,7 @@
 
 Every state is solved in both treatments of wrinkling. It counts as a fault when a call raises or warns, when a number
 is NaN though the status promises an answer, and when a force is off by more than ten times its own error estimate,
-judged by `model.reference`.
+judged by `model.verification.reference`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from model import membrane
-from model.materials import NAMED, Material
-from model.membrane import Status
+from model.material.materials import NAMED, Material
+from model.membrane import solve as membrane
+from model.membrane.solve import Status
 from model.specimen import Specimen
 from rig.benchmark.cases import Case, Generator, log_uniform, random_case, slack_voltage, solve_reference
 

@@ -19,18 +19,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.certificate import Certificate
-from calibration.curve import Curve
-from calibration.identify import identify
-from calibration.problem import Problem
-from calibration.reduction import select
-from model.materials import Material
-from model.membrane import solve_many
+from calibration.film.curve import Curve
+from calibration.film.identify import identify
+from calibration.film.problem import Problem
+from calibration.film.reduction import select
+from calibration.sensors.certificate import Certificate
+from model.material.materials import Material
+from model.membrane.solve import solve_many
 from model.specimen import Specimen
-from rig import proposal
+from rig.analysis import proposal
 from rig.experiment import certificates_of
-from rig.protocol import Protocol
-from rig.scene import Scene, load_scene
+from rig.protocol.protocol import Protocol
+from rig.scene.scene import Scene, load_scene
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

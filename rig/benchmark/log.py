@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rig.clock import RealClock
-from rig.errors import ConfigError
+from rig.base.clock import RealClock
+from rig.base.errors import ConfigError
 from rig.log.dataset import load_run
 from rig.log.errors import LogError
 from rig.log.part_file import PartFile

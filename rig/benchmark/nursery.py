@@ -20,8 +20,8 @@ from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
-from drivers.link import DeviceError
-from rig.errors import RigError
+from drivers.links.link import DeviceError
+from rig.base.errors import RigError
 from rig.experiment import Consent, Experiment, prepare, run
 from rig.safety import remote
 
@@ -31,7 +31,9 @@ CONSENT = Consent("a benchmark", "a benchmark")
 def main(scene: str, protocol: str) -> None:
     experiment = prepare(Path(scene), Path(protocol))
     # The product starts a guard's process afresh each time; here they are forked from one that has read the modules.
-    multiprocessing.set_forkserver_preload(["rig.safety.process", "can", "drivers.can_link", "drivers.iseg_edcp"])
+    multiprocessing.set_forkserver_preload(
+        ["rig.safety.process", "can", "drivers.links.can_link", "drivers.instruments.iseg_edcp"]
+    )
     forkserver.ensure_running()
     importlib.import_module("can")  # the engine reads it while it starts the guard
     remote.get_context = lambda method: multiprocessing.get_context("forkserver")  # type: ignore[assignment, attr-defined]

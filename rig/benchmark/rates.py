@@ -28,20 +28,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.gsv8 import Decoder, Measured
+from drivers.instruments.gsv8 import Decoder, Measured
 from drivers.roles import Device, ForceSample, Sample
 from rig import experiment
-from rig.bench import Bench
-from rig.clock import RealClock
-from rig.engine import LONGEST_TURN_S, SETUP_LIMIT_S, SHORTEST_TURN_S
-from rig.errors import RigError
+from rig.base.clock import RealClock
+from rig.base.errors import RigError
+from rig.base.toml_file import validate
+from rig.bench.bench import Bench
+from rig.engine.engine import LONGEST_TURN_S, SETUP_LIMIT_S, SHORTEST_TURN_S
 from rig.log.reader import read_log
 from rig.log.schema import ROLES
-from rig.scene import Scene, load_scene
+from rig.scene.scene import Scene, load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import ForceTruth
 from rig.sim.wire import ByteWire
-from rig.toml_file import validate
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -232,7 +232,7 @@ def _drivers(path: Path, seconds: float, progress: Callable[[float], None]) -> R
 
 
 def _turn(bench: Bench) -> list[tuple[str, Sample]]:
-    """One turn as `rig.engine.Engine` makes it, without what it does with the samples."""
+    """One turn as `rig.engine.engine.Engine` makes it, without what it does with the samples."""
     now = bench.clock.now()
     samples = [(role, sample) for role, device in bench.devices.items() for sample in device.poll(now)]
     wanted = min(device.next_poll for device in bench.devices.values())

@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rig.base.errors import LimitError, RigError
 from rig.benchmark.stand import Run, Stand
-from rig.errors import LimitError, RigError
 from rig.safety.heartbeat import DEADLINE_S, INTERVAL_S
 from rig.safety.limits import FilmLimits, Limits
-from rig.scene import load_scene
+from rig.scene.scene import load_scene
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

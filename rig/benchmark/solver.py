@@ -2,7 +2,7 @@
 
 Times are processor time of one process, so that what else runs on the machine matters little, and mean something only
 as ratios within one run: every method solves one state before any goes on to the next, in several rounds, and the least
-time counts. References come from `model.reference`, which does not compete.
+time counts. References come from `model.verification.reference`, which does not compete.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from model import baselines, membrane
-from model.baselines import Result
-from model.materials import NAMED
-from model.reference import Reference, reference
+from model.material.materials import NAMED
+from model.membrane import solve as membrane
 from model.specimen import Specimen
+from model.verification import baselines
+from model.verification.baselines import Result
+from model.verification.reference import Reference, reference
 from rig.benchmark.cases import Case, taut_cases
 
 if TYPE_CHECKING:
@@ -490,15 +491,16 @@ _FILM = "Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED['parker-cao2018'])"
 def _one_off() -> dict[str, float]:
     """Seconds, in a fresh interpreter: imports, and the first solve, which also fills caches."""
     jobs = {
-        "dea-rig": ("from model.membrane import solve", f"solve({_FILM}, 10e-3, 1500.0)"),
+        "dea-rig": ("from model.membrane.solve import solve", f"solve({_FILM}, 10e-3, 1500.0)"),
         "SciPy (DOP853 shooting)": (
-            "import scipy.integrate, scipy.optimize\nfrom model.baselines import explicit_shooting as solve",
+            "import scipy.integrate, scipy.optimize\n"
+            "from model.verification.baselines import explicit_shooting as solve",
             f"solve({_FILM}, 10e-3, 1500.0, 1e-6)",
         ),
     }
     out = {}
     for name, (imports, first) in jobs.items():
-        common = "\nfrom model.materials import NAMED\nfrom model.specimen import Specimen"
+        common = "\nfrom model.material.materials import NAMED\nfrom model.specimen import Specimen"
         done = subprocess.run(
             [sys.executable, "-c", _FRESH.format(imports=imports + common, first=first)],
             capture_output=True,

@@ -17,9 +17,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Self
 
-from rig.bench import simulated_bench
-from rig.errors import RigError
-from rig.scene import load_scene
+from rig.base.errors import RigError
+from rig.bench.bench import simulated_bench
+from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.served import Driven, ServedBench
 

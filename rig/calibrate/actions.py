@@ -1,7 +1,7 @@
 """How calibration actions are carried out: generators that the engine's loop resumes once a turn.
 
 Each standstill leaves in the log a phase ``standstill``, labelled with its standard, and a reference ``applied`` with
-what was applied and its own standard uncertainty; each way of a glide leaves a phase ``way``. `rig.calibrate.analysis`
+what was applied and its own standard uncertainty; each way of a glide leaves a phase ``way``. `rig.analysis.sensors`
 needs nothing else.
 """
 
@@ -14,13 +14,13 @@ import numpy as np
 
 from drivers.roles import ForceSample, Sample
 from rig.actions import Turns, listening, pause, set_voltage, stand_still, take_down
-from rig.control import Question
-from rig.errors import FaultError
-from rig.plan import Action
+from rig.base.errors import FaultError
+from rig.operator.control import Question
+from rig.protocol.plan import Action
 from rig.sim.operator import Operator
 
 if TYPE_CHECKING:
-    from rig.engine import Engine
+    from rig.engine.engine import Engine
 
 MOST_STEPS = 200  # of a dummy pressed: more means that it gives way, or is not there
 FIXTURES = {

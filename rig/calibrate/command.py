@@ -9,17 +9,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.sensor import COVERAGE, SensorError, Standstill
-from rig.calibrate import analysis
-from rig.calibrate.analysis import ROLE, UNIT, Calibration, Quantity
-from rig.calibrate.certificate_file import certificate_text
-from rig.calibrate.defaults import protocol_text, verify_text
-from rig.errors import ConfigError, DataError
+from calibration.sensors.sensor import COVERAGE, SensorError, Standstill
+from rig.analysis import sensors as analysis
+from rig.analysis.certificate_file import certificate_text
+from rig.analysis.film import write_text
+from rig.analysis.sensor_protocols import protocol_text, verify_text
+from rig.analysis.sensors import ROLE, UNIT, Calibration, Quantity
+from rig.base.errors import ConfigError, DataError
+from rig.base.outputs import check_new
 from rig.experiment import Experiment, prepare
-from rig.identification import write_text
 from rig.log.dataset import load_run
-from rig.outputs import check_new
-from rig.scene import load_scene
+from rig.scene.scene import load_scene
 
 Run = Callable[[Experiment, Path], None]
 
@@ -65,7 +65,7 @@ def calibrate(
         found = analysis.calibrate(log, quantity)
     if quantity != "timing":
         write_text(certificate, certificate_text(found, valid_days))
-    from rig.calibrate.picture import draw
+    from rig.analysis.sensor_picture import draw
 
     draw(found, picture)
     return found, wanted

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from rig.base.errors import LimitError
 from rig.calibrate import steps
-from rig.errors import LimitError
-from rig.plan import Action
-from rig.scene import Scene
+from rig.protocol.plan import Action
+from rig.scene.scene import Scene
 
 OPERATOR_S = 10.0  # for the estimate: what an operator takes to do what he is asked
 PRESS_STEPS = 20  # for the estimate: how many steps pressing a dummy takes

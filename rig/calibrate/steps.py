@@ -1,4 +1,4 @@
-"""Protocol steps that calibrate the bench's instruments. They stand among the steps of `rig.protocol`.
+"""Protocol steps that calibrate the bench's instruments. They stand among the steps of `rig.protocol.protocol`.
 
 Every standard is applied rising and falling, several times; each standstill waits ``settle_s`` and then reads for
 ``average_s``. Positions are the stage's own, because there need be no film.
@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from rig.table import Table
+from rig.base.table import Table
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]

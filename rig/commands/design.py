@@ -10,12 +10,12 @@ from pathlib import Path
 
 import click
 
-from rig.clock import RealClock
+from rig.base.clock import RealClock
+from rig.base.errors import ConfigError
+from rig.base.progress import progress
+from rig.cli.show import show
 from rig.design.run import run_study
 from rig.design.study import load_study
-from rig.errors import ConfigError
-from rig.progress import progress
-from rig.tables import show
 
 
 def carry_out(study_file: Path, out: Path, workers: int, dask: str | None, compare: bool) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import click
 
-from rig.follow.analysis import Stroke, strokes
-from rig.identification import write_text
-from rig.outputs import check_new
-from rig.tables import show, stroke_table
+from rig.analysis.film import write_text
+from rig.analysis.strokes import Stroke, strokes
+from rig.base.outputs import check_new
+from rig.cli.show import show, stroke_table
 
 UNITS = {
     "nominal_voltage": "V",
@@ -41,7 +41,7 @@ def tell_strokes(log: Path, out: Path | None, picture: Path | None, fit: Path | 
     if out is not None:
         write_text(out, _csv(found))
     if picture is not None:
-        from rig.follow.picture import draw
+        from rig.analysis.stroke_picture import draw
 
         draw(found, picture)
     for path in (out, picture):

@@ -7,13 +7,13 @@ from typing import Any
 
 from rich.table import Table
 
-from model.design import Point, Treatment
-from model.optimise import Design, Optimum, Task, Uncertain
-from model.stroke import Limit
+from model.actuator.design import Point, Treatment
+from model.actuator.optimise import Design, Optimum, Task, Uncertain
+from model.actuator.stroke import Limit
+from rig.analysis.fit_file import read_fit
+from rig.base.errors import ConfigError
 from rig.design import pictures
 from rig.design.study import VARIABLES, OptimiseStudy
-from rig.errors import ConfigError
-from rig.fit_file import read_fit
 
 
 def task_of(study: OptimiseStudy) -> Task:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from model.design import Row, Treatment
+from model.actuator.design import Row, Treatment
 
 CASES = {"I": "spring", "II": "mass", "III": "double cone"}
 NAMES = {

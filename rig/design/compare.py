@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from model.baselines import paper_shooting
-from model.bias import Antagonist
-from model.design import Point, Row, Treatment
+from model.actuator.bias import Antagonist
+from model.actuator.design import Point, Row, Treatment
 from model.specimen import Specimen
+from model.verification.baselines import paper_shooting
 
 Array = NDArray[np.float64]
 TOLERANCE = 1e-6

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from model.design import Row
+from model.actuator.design import Row
 from rig.design.claims import Claims
 
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.figures import RC, STYLES
-from model.design import Row
+from calibration.report.figures import RC, STYLES
+from model.actuator.design import Row
 from rig.design.claims import CASES, NAMES, PRINTED, value
 
 if TYPE_CHECKING:

@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model import design
-from model.design import Point, Treatment
-from model.limits import breakdown_voltage
-from model.membrane import Solution, solve, solve_many
-from model.optimise import optimise
-from model.profile import Profile
-from model.stroke import Limit, Strokes, strokes
+from model.actuator import design
+from model.actuator.design import Point, Treatment
+from model.actuator.optimise import optimise
+from model.actuator.stroke import Limit, Strokes, strokes
+from model.membrane.profile import Profile
+from model.membrane.solve import Solution, solve, solve_many
+from model.stability.limits import breakdown_voltage
+from rig.base.errors import ConfigError
+from rig.base.outputs import check_new
 from rig.design import best, pictures
 from rig.design import compare as shooting
 from rig.design.claims import Claims, judge
 from rig.design.output import claim_rows, map_rows, write_csv
 from rig.design.study import BoundaryStudy, MapStudy, OptimiseStudy, ProfilesStudy, Study
 from rig.design.tables import claim_tables, map_table
-from rig.errors import ConfigError
-from rig.outputs import check_new
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -8,15 +8,15 @@ from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from model.bias import Mass, Spring
-from model.design import Recipe, SameFilm, Treatment
-from model.materials import NAMED, Material
+from model.actuator.bias import Mass, Spring
+from model.actuator.design import Recipe, SameFilm, Treatment
+from model.actuator.stroke import Criteria
+from model.material.materials import NAMED, Material
 from model.specimen import Specimen
-from model.stroke import Criteria
-from rig.errors import ConfigError
-from rig.scene import MaterialTable
-from rig.table import Table
-from rig.toml_file import read_text, validate
+from rig.base.errors import ConfigError
+from rig.base.table import Table
+from rig.base.toml_file import read_text, validate
+from rig.scene.scene import MaterialTable
 
 Positive = Annotated[float, Field(gt=0)]
 Stretch = Annotated[float, Field(ge=1.0, le=6.0)]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from model.design import Row
+from model.actuator.design import Row
 from rig.design.claims import CASES, NAMES, Claims, Compared, best
 
 if TYPE_CHECKING:

@@ -10,14 +10,14 @@ import numpy as np
 
 from drivers.roles import DisplacementSample, ForceSample, Sample
 from rig.actions import Turns, listening, pause
-from rig.errors import FaultError
-from rig.plan import Action
+from rig.base.errors import FaultError
+from rig.protocol.plan import Action
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-    from model.bias import Bias
-    from rig.engine import Engine
+    from model.actuator.bias import Bias
+    from rig.engine.engine import Engine
 
 SIGMAS = 2.0  # the mean excess must be zero within this many of its standard errors to be called a rest ...
 NEAR_N = 0.3e-3  # ... or within this

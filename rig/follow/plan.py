@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from model.actuator import Actuator, balance, equilibria
-from rig.errors import LimitError
-from rig.follow.steps import Follow
-from rig.plan import Action
-from rig.scene import Scene
+from model.actuator.equilibrium import Actuator, balance, equilibria
+from rig.base.errors import LimitError
+from rig.protocol.plan import Action
+from rig.scene.scene import Scene
+from rig.steps.follow import Follow
 
 # Part of the way to the balance that one cycle goes. With d cycles of delay between a move and the force that shows it
 # the loop is stable below 2 sin(pi/(4 d + 2)) of the true stiffness: 0.35 for four cycles, that is 100 ms at 40 Hz.

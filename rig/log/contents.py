@@ -11,7 +11,7 @@ from rig.log.reader import Log
 from rig.log.text import printable
 
 if TYPE_CHECKING:
-    from calibration.certificate import Certificate
+    from calibration.sensors.certificate import Certificate
 
 _SAID = re.compile(r"model (.*?), serial (.*?), firmware (.*?)(?:;|$)")
 
@@ -27,7 +27,7 @@ def certificates_in(log: Log) -> dict[str, Certificate]:
     found: dict[str, Certificate] = {}
     for name, attachment in log.attachments.items():
         if name.startswith("certificate."):
-            from calibration.certificate import CertificateError, parse_certificate
+            from calibration.sensors.certificate import CertificateError, parse_certificate
 
             try:
                 certificate = parse_certificate(attachment.data, f"{printable(name)} inside")

@@ -15,8 +15,8 @@ from rig.log.errors import LogError
 from rig.log.reader import Columns, Log, read_tables
 
 if TYPE_CHECKING:
-    from calibration.certificate import Certificate
-    from calibration.curve import Curve
+    from calibration.film.curve import Curve
+    from calibration.sensors.certificate import Certificate
     from model.specimen import Specimen
 
 Floats = NDArray[np.float64]
@@ -51,7 +51,7 @@ class Reference(NamedTuple):
 
 
 class CurveErrors(TypedDict, total=False):
-    """The uncertainties of `calibration.curve.Curve`, which explains them."""
+    """The uncertainties of `calibration.film.curve.Curve`, which explains them."""
 
     force_noise: Required[float]
     displacement_noise: float
@@ -147,7 +147,7 @@ class Run:
             Uncertainties for every curve. Those of the force zero and of the displacement zero come from the log's
             references unless they are given.
         """
-        from calibration.curve import Curve
+        from calibration.film.curve import Curve
 
         parts: dict[tuple[int, float, int], list[int]] = {}
         start: Phase | None = None  # of the ramps and holds that are going on

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rig.errors import RigError
+from rig.base.errors import RigError
 
 
 class LogError(RigError):

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from rig.clock import RealClock
+from rig.base.clock import RealClock
 from rig.log import frames
 from rig.log.errors import LogError
 from rig.log.remote import RemoteLog

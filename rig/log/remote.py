@@ -26,7 +26,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rig.clock import RealClock
+from rig.base.clock import RealClock
 from rig.log import frames, schema
 from rig.log.checks import Checks
 from rig.log.errors import LogError

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from rig.clock import RealClock
+from rig.base.clock import RealClock
 from rig.log import frames, schema
 from rig.log.errors import LogError
 from rig.log.writer import LogWriter

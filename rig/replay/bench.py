@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple, NoReturn
 
-from drivers.link import DeviceError
+from drivers.links.link import DeviceError
 from rig.replay.recording import Recording
 from rig.replay.served import DIALECTS, Lag, Passed, ServedScript
-from rig.scene import CanTable
+from rig.scene.scene import CanTable
 from rig.sim.wire import ByteWire, Frame, FrameWire
 
 

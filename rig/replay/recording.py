@@ -9,18 +9,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from calibration.certificate import Certificate
-from rig.errors import ConfigError, LimitError
+from calibration.sensors.certificate import Certificate
+from rig.base.errors import ConfigError, LimitError
+from rig.base.toml_file import parse_table
 from rig.experiment import ON_PORTS, Experiment
 from rig.log import schema
 from rig.log.contents import certificates_in
 from rig.log.errors import LogError
 from rig.log.reader import Log, read_log
-from rig.plan import Action, plan
-from rig.protocol import Protocol
-from rig.resume import actions_from
-from rig.scene import Scene
-from rig.toml_file import parse_table
+from rig.protocol.plan import Action, plan
+from rig.protocol.protocol import Protocol
+from rig.run.resume import actions_from
+from rig.scene.scene import Scene
 
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 

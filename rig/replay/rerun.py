@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
-from rig.bench import Bench
-from rig.control import Answer, Control, Question
-from rig.engine import Engine, Outcome
+from rig.bench.bench import Bench
+from rig.engine.engine import Engine, Outcome
 from rig.experiment import gains_of
+from rig.operator.control import Answer, Control, Question
 from rig.replay.bench import Departure, ReplayBench
 from rig.replay.recording import Recording
 from rig.replay.steering import SteeredBench

@@ -18,13 +18,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from drivers.link import DeviceError
+from drivers.links.link import DeviceError
 from drivers.roles import Device, HVSupply, Sample
-from rig.bench import Bench, Tap, Wired
-from rig.clock import VirtualClock
-from rig.engine import SHORTEST_TURN_S
+from rig.base.clock import VirtualClock
+from rig.bench.bench import Bench, Tap, Wired
+from rig.engine.engine import SHORTEST_TURN_S
 from rig.replay.recording import Recording, Row
-from rig.scene import Scene
+from rig.scene.scene import Scene
 
 DECISIONS = ("/phase", "/target", "/reference", "/command")
 COUNTED = "counted: "  # an event that says so is the end of polling

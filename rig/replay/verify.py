@@ -13,14 +13,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
-from drivers.link import DeviceError
+from drivers.links.link import DeviceError
 from drivers.roles import HVSupply, Stage
-from rig.bench import Bench
+from rig.bench.bench import Bench
 from rig.experiment import gains_of
 from rig.log import schema
-from rig.recorder import Recorder
+from rig.log.recorder import Recorder
 from rig.replay.recording import Recording, Row, numbers
-from rig.scene import CanTable, Scene
+from rig.scene.scene import CanTable, Scene
 from rig.sim.wire import ByteWire, Frame, FrameWire
 
 if TYPE_CHECKING:

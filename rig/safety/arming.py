@@ -7,7 +7,7 @@ prompt at which somebody may have touched the rig, it has to be given again.
 
 from __future__ import annotations
 
-from rig.errors import FaultError
+from rig.base.errors import FaultError
 
 
 class Arming:

@@ -15,7 +15,7 @@ from enum import Enum, Flag
 from typing import TYPE_CHECKING, TypeAlias
 
 from drivers.roles import HVFlag, HVSample, HVSupply
-from rig.errors import FaultError, LimitError, StaleData
+from rig.base.errors import FaultError, LimitError, StaleData
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limit, Limits
 

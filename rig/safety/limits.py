@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from model.membrane import Solution, Status, solve
+from model.membrane.solve import Solution, Status, solve
 from model.specimen import Specimen
-from rig.errors import LimitError
-from rig.scene import Scene
+from rig.base.errors import LimitError
+from rig.scene.scene import Scene
 
 # A monitor has noise and a gain error: a commanded voltage at its limit must not trip on them.
 MONITOR_V = 50.0

@@ -26,19 +26,19 @@ from typing import Literal
 
 import click
 
-from drivers.link import DeviceError
+from drivers.links.link import DeviceError
 from drivers.roles import HVSample, HVSupply
-from rig.clock import RealClock
-from rig.errors import FaultError, LimitError
-from rig.host import HostTime
+from rig.base.clock import RealClock
+from rig.base.errors import FaultError, LimitError
+from rig.base.host import HostTime
 from rig.log.errors import LogError
+from rig.log.recorder import Severity
 from rig.log.remote import RemoteLog
-from rig.recorder import Severity
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import ADVICE, AT_ONCE_S, NOT_SAFE, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.safety.supply import ROLE, Link, SupplyTable, make_driver, open_link
-from rig.scene import Scene
+from rig.scene.scene import Scene
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005
 STATE_S = 0.05  # how often the engine hears from us at least

@@ -18,18 +18,18 @@ from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
-from drivers.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
+from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, HVSupply, Identity, Sample
-from rig.bench import Tap
-from rig.clock import RealClock
-from rig.errors import FaultError, LimitError, RigError, StaleData
-from rig.recorder import Severity
+from rig.base.clock import RealClock
+from rig.base.errors import FaultError, LimitError, RigError, StaleData
+from rig.bench.bench import Tap
+from rig.log.recorder import Severity
 from rig.safety import process
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.safety.supply import ROLE, Link, make_driver, open_link
-from rig.scene import IsegTable, Scene
+from rig.scene.scene import IsegTable, Scene
 
 START_S = 30.0  # until the process must have opened the link; a slow disk has many modules to read
 ANSWER_S = 1.0  # a guard that takes longer to answer is lost

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import cast
 
-from drivers.link import ByteLink, FrameLink
+from drivers.links.link import ByteLink, FrameLink
 from drivers.roles import HVSupply
-from rig.bench import Tap, TappedByteLink, TappedFrameLink, arguments
-from rig.scene import IsegTable, ShvpsTable
+from rig.bench.bench import Tap, TappedByteLink, TappedFrameLink, arguments
+from rig.scene.scene import IsegTable, ShvpsTable
 
 ROLE = "hv"
 
@@ -21,15 +21,15 @@ def open_link(table: SupplyTable) -> Link:
 
     Raises
     ------
-    drivers.link.DeviceError
+    drivers.links.link.DeviceError
         It cannot be opened, or somebody else has it.
     """
     if isinstance(table, IsegTable):
-        from drivers.can_link import CanLink
+        from drivers.links.can_link import CanLink
 
         assert table.interface is not None and table.can_channel is not None
         return CanLink(ROLE, table.interface, table.can_channel, table.bitrate)
-    from drivers.serial_link import SerialLink
+    from drivers.links.serial_link import SerialLink
 
     assert table.port is not None
     return SerialLink(ROLE, table.port, table.baud)
@@ -41,9 +41,9 @@ def make_driver(table: SupplyTable, link: Link, tap: Tap, when: Callable[[], flo
     The first poll sends the first byte.
     """
     if isinstance(table, IsegTable):
-        from drivers.iseg_edcp import IsegEDCP
+        from drivers.instruments.iseg_edcp import IsegEDCP
 
         return IsegEDCP(ROLE, TappedFrameLink(ROLE, cast(FrameLink, link), tap, when), **arguments(table, IsegEDCP))
-    from drivers.shvps import Shvps
+    from drivers.instruments.shvps import Shvps
 
     return Shvps(ROLE, TappedByteLink(ROLE, cast(ByteLink, link), tap, when), **arguments(table, Shvps))

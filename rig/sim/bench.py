@@ -15,12 +15,14 @@ from typing import Protocol
 import numpy as np
 
 from model.specimen import Specimen
-from rig.sim.cia404 import CiA404
 from rig.sim.faults import Upset
 from rig.sim.film import Solve, solve_membrane
-from rig.sim.gsv8 import GSV8
-from rig.sim.iseg import IsegEDCP
-from rig.sim.keyence import KeyenceLKG
+from rig.sim.instruments.cia404 import CiA404
+from rig.sim.instruments.gsv8 import GSV8
+from rig.sim.instruments.iseg import IsegEDCP
+from rig.sim.instruments.keyence import KeyenceLKG
+from rig.sim.instruments.shvps import Shvps
+from rig.sim.instruments.zaber import ZaberStage
 from rig.sim.operator import Operator
 from rig.sim.settings import (
     LINK_FAULTS,
@@ -34,10 +36,8 @@ from rig.sim.settings import (
     SimulationSettings,
     StageTruth,
 )
-from rig.sim.shvps import Shvps
 from rig.sim.wire import ByteWire, FrameWire
 from rig.sim.world import World
-from rig.sim.zaber import ZaberStage
 
 ROLES = ("stage", "force", "displacement", "hv")
 

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from model.specimen import Specimen
-from rig.errors import ConfigError
+from rig.base.errors import ConfigError
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -52,7 +52,7 @@ class FilmTableError(ConfigError):
 
 def solve_membrane(specimen: Specimen, h: Floats, voltage: Floats) -> tuple[Floats, Floats, Bools]:
     """Ask the membrane model; wrinkled films by their relaxed energy, slack ones carry nothing and are free films."""
-    from model.membrane import Status, solve_many
+    from model.membrane.solve import Status, solve_many
 
     h, voltage = np.broadcast_arrays(h, voltage)
     solutions = solve_many(specimen, h, voltage, wrinkling="tension_field")
@@ -67,7 +67,7 @@ def solve_membrane(specimen: Specimen, h: Floats, voltage: Floats) -> tuple[Floa
 
 def _free_field(specimen: Specimen, h: Floats, voltage: Floats) -> Floats:
     """True field of a slack film: it expands until a cone of its stretch would just be slack. NaN if it never is."""
-    from model.limits import slack_voltage
+    from model.stability.limits import slack_voltage
 
     stretch = np.linspace(1.0, FREE_STRETCH, FREE_NODES)  # beyond the pre-stretch
     balance = slack_voltage(specimen, (specimen.ring_radius - specimen.disk_radius) * np.sqrt(stretch**2 - 1.0))
@@ -244,7 +244,7 @@ def _by_halving(specimen: Specimen, h: Floats, solve: Solve) -> tuple[Floats, Fl
     The field grows faster than the voltage, so that each state puts a bound to the voltage at which the strength is
     reached; below it is halved, for what lies beyond the last state takes long to solve.
     """
-    from model.limits import slack_voltage
+    from model.stability.limits import slack_voltage
 
     low = np.ones_like(h)
     _, field, found = solve(specimen, h, low)

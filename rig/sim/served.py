@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Self, TypeVar
 
-from rig.clock import RealClock
+from rig.base.clock import RealClock
 from rig.sim.bench import SimulatedBench
-from rig.sim.iseg import IsegEDCP
+from rig.sim.instruments.iseg import IsegEDCP
 from rig.sim.server import Server
 
 T = TypeVar("T")

@@ -11,7 +11,7 @@ import select
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from rig.clock import Clock
+from rig.base.clock import Clock
 from rig.sim.slcan import SlcanAdapter
 from rig.sim.wire import ByteWire, FrameWire, WireGone
 

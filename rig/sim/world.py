@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from model.materials import Material
+from model.material.materials import Material
 from model.specimen import Specimen
 from rig.sim.film import FilmTable, Solve, solve_membrane, tabulate
 from rig.sim.path import Path

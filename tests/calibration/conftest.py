@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration.curve import Curve
-from model.materials import NAMED, Material
-from model.membrane import solve_many
+from calibration.film.curve import Curve
+from model.material.materials import NAMED, Material
+from model.membrane.solve import solve_many
 from model.specimen import Specimen
 
 PARKER = NAMED["parker-cao2018"]

@@ -9,11 +9,11 @@ import lmfit
 import numpy as np
 import pytest
 
-from calibration.curve import Curve
-from calibration.identify import identify
-from calibration.problem import EXPONENT_BOUNDS, SHARE_BOUNDS, Problem
-from calibration.reduction import select
-from model.materials import Material
+from calibration.film.curve import Curve
+from calibration.film.identify import identify
+from calibration.film.problem import EXPONENT_BOUNDS, SHARE_BOUNDS, Problem
+from calibration.film.reduction import select
+from model.material.materials import Material
 
 Experiment = Callable[..., list[Curve]]
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from model.materials import NAMED
+from model.material.materials import NAMED
 from model.specimen import Specimen
-from rig.clock import RealClock
+from rig.base.clock import RealClock
 from rig.sim.bench import SimulatedBench
 from rig.sim.server import Server
 from rig.sim.settings import SimulationSettings

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from model.bias import Mass, Spring
-from model.design import SameFilm, Treatment, points, sweep
-from model.materials import NAMED
+from model.actuator.bias import Mass, Spring
+from model.actuator.design import SameFilm, Treatment, points, sweep
+from model.actuator.stroke import Criteria
+from model.material.materials import NAMED
 from model.specimen import Specimen
-from model.stroke import Criteria
 
 distributed = pytest.importorskip("distributed", reason="needs the conformance dependency group")
 pytestmark = pytest.mark.conformance

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from drivers.dialogue import LOOK_AGAIN_S, Answer, Ask, Dialogue, Script
-from drivers.link import DeviceLost, DeviceRefused, DeviceSilent
+from drivers.links.link import DeviceLost, DeviceRefused, DeviceSilent
 
 
 class Wire:

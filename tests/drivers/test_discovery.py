@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import pytest
 
-from drivers import can_link
 from drivers.discovery import Bus, Found, discover
-from drivers.link import ByteLink, CanFrame, DeviceError, DeviceLost
+from drivers.links import can_link
+from drivers.links.link import ByteLink, CanFrame, DeviceError, DeviceLost
 from drivers.roles import Identity
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from drivers import keyence_lkg, shvps, zaber
+from drivers.instruments import keyence_lkg, shvps, zaber
 
 BATCH = 100  # lines in one stream, every other one with damage of its own
 POOL = 4000

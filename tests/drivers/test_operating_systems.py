@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from drivers.link import DeviceError, DeviceLost
+from drivers.links.link import DeviceError, DeviceLost
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("drivers", "rig", "calibration", "model", "sim_fixtures")
@@ -137,7 +137,7 @@ class Port:
 
 @pytest.fixture
 def windows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    """`drivers.serial_link`, imported anew as if on Windows."""
+    """`drivers.links.serial_link`, imported anew as if on Windows."""
     import tempfile
 
     import serial
@@ -150,7 +150,7 @@ def windows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(serial, "Serial", Port)
     monkeypatch.setattr(serial.tools.list_ports, "comports", list)
-    spec = importlib.util.spec_from_file_location("serial_link_on_windows", ROOT / "drivers" / "serial_link.py")
+    spec = importlib.util.spec_from_file_location("serial_link_on_windows", ROOT / "drivers" / "links" / "serial_link.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.certificate import load_certificate
-from drivers.link import DeviceError
-from rig.bench import Bench
-from rig.control import Control
-from rig.engine import Engine, Outcome
-from rig.errors import RigError
+from calibration.sensors.certificate import load_certificate
+from drivers.links.link import DeviceError
+from rig.base.errors import RigError
+from rig.base.toml_file import parse_table
+from rig.bench.bench import Bench
+from rig.engine.engine import Engine, Outcome
 from rig.log.reader import read_log
+from rig.log.recorder import Gains
 from rig.log.writer import LogWriter
-from rig.plan import check_plan, plan
-from rig.protocol import Protocol
-from rig.recorder import Gains
-from rig.scene import Scene
+from rig.operator.control import Control
+from rig.protocol.plan import check_plan, plan
+from rig.protocol.protocol import Protocol
+from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
-from rig.toml_file import parse_table
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 # The film of the scenes, so near that the way to it is short.

@@ -12,15 +12,15 @@ from typing import Any
 
 import pytest
 
-from drivers.link import DeviceSilent
+from drivers.links.link import DeviceSilent
 from rig import actions
-from rig.clock import VirtualClock
-from rig.control import Control
-from rig.errors import FaultError, StaleData
+from rig.base.clock import VirtualClock
+from rig.base.errors import FaultError, StaleData
 from rig.log.reader import read_log
+from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
+from rig.sim.instruments.zaber import ZaberStage
 from rig.sim.settings import Fault
-from rig.sim.zaber import ZaberStage
 
 Tell = Callable[..., Any]  # of conftest.Story
 SPEED = 0.8e-3  # m/s

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.clock import VirtualClock
-from rig.errors import FaultError
+from rig.base.clock import VirtualClock
+from rig.base.errors import FaultError
 from rig.log.reader import read_log
 
 Tell = Callable[..., Any]  # of conftest.Story

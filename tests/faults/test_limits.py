@@ -16,17 +16,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.roles import ForceSample
-from rig.bench import Bench
-from rig.control import Control
-from rig.errors import FaultError, LimitError, StaleData
+from rig.base.errors import FaultError, LimitError, StaleData
+from rig.base.toml_file import parse_table
+from rig.bench.bench import Bench
+from rig.engine.watch import FROZEN_FEWEST, Watch, check_zero
 from rig.log.reader import read_log
-from rig.recorder import Gains, Recorder
+from rig.log.recorder import Gains, Recorder
+from rig.operator.control import Control
 from rig.safety.limits import Limits
-from rig.scene import Scene
+from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault
-from rig.toml_file import parse_table
-from rig.watch import FROZEN_FEWEST, Watch, check_zero
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 Tell = Callable[..., Any]  # of conftest.Story

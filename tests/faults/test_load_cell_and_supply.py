@@ -12,14 +12,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from drivers.gsv8 import GSV8
-from drivers.iseg_edcp import IsegEDCP
-from drivers.link import DeviceError, DeviceSilent
+from drivers.instruments.gsv8 import GSV8
+from drivers.instruments.iseg_edcp import IsegEDCP
+from drivers.links.link import DeviceError, DeviceSilent
 from drivers.roles import ForceSample, HVFlag, HVSample, SampleFlag
-from model.materials import NAMED
+from model.material.materials import NAMED
 from model.specimen import Specimen
-from rig.clock import VirtualClock
-from rig.memory_link import MemoryByteLink, MemoryFrameLink
+from rig.base.clock import VirtualClock
+from rig.bench.memory_link import MemoryByteLink, MemoryFrameLink
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault, ForceTruth, SimulationSettings
 from rig.sim.wire import ByteWire, FrameWire

@@ -19,11 +19,13 @@ from typing import Any
 
 import pytest
 
-from drivers.cia404 import CiA404
-from drivers.gsv8 import GSV8
-from drivers.iseg_edcp import IsegEDCP
-from drivers.keyence_lkg import KeyenceLKG
-from drivers.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
+from drivers.instruments.cia404 import CiA404
+from drivers.instruments.gsv8 import GSV8
+from drivers.instruments.iseg_edcp import IsegEDCP
+from drivers.instruments.keyence_lkg import KeyenceLKG
+from drivers.instruments.shvps import Shvps
+from drivers.instruments.zaber import ZaberStage
+from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import (
     DisplacementSample,
     ForceSample,
@@ -34,12 +36,10 @@ from drivers.roles import (
     SampleFlag,
     StageSample,
 )
-from drivers.shvps import Shvps
-from drivers.zaber import ZaberStage
-from model.materials import NAMED
+from model.material.materials import NAMED
 from model.specimen import Specimen
-from rig.clock import VirtualClock
-from rig.memory_link import MemoryByteLink, MemoryFrameLink
+from rig.base.clock import VirtualClock
+from rig.bench.memory_link import MemoryByteLink, MemoryFrameLink
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import TWINS, Fault, SimulationSettings
 from rig.sim.wire import FrameWire

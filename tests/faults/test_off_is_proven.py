@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from rig.bench import Bench
-from rig.control import Control
+from rig.bench.bench import Bench
+from rig.operator.control import Control
 from rig.safety import process
 from rig.safety.channel import Channel
 from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
 from rig.safety.heartbeat import Heartbeat
 from rig.safety.process import TRY_S, Server, Voice
-from rig.scene import load_scene
+from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault
 

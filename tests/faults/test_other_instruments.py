@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from rig.control import Control
-from rig.errors import FaultError
+from rig.base.errors import FaultError
+from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault
 

@@ -42,8 +42,8 @@ ROWS: dict[int, Row] = {
         [
             "faults/test_processes.py::test_engine_hung",
             "faults/test_processes.py::test_engine_that_was_stopped_and_goes_on_gets_no_voltage_any_more",
-            "rig/test_heartbeat.py::test_a_silent_engine_is_left_no_voltage_after_the_deadline_and_not_before",
-            "rig/test_heartbeat.py::test_a_heartbeat_that_cannot_be_believed_takes_the_output_off_at_once",
+            "rig/safety/test_heartbeat.py::test_a_silent_engine_is_left_no_voltage_after_the_deadline_and_not_before",
+            "rig/safety/test_heartbeat.py::test_a_heartbeat_that_cannot_be_believed_takes_the_output_off_at_once",
         ],
     ),
     4: (
@@ -91,9 +91,9 @@ ROWS: dict[int, Row] = {
             "faults/test_limits.py::test_a_move_into_the_field_limit_is_refused_before_the_stage_moves",
             "faults/test_limits.py::test_a_voltage_into_the_field_limit_is_refused_before_the_output_rises",
             "faults/test_limits.py::test_a_film_that_is_moved_by_somebody_else_is_cut_off_at_its_field_limit",
-            "rig/test_heartbeat.py::test_a_move_is_asked_for_and_a_voltage_is_held_against_where_it_leads",
-            "rig/test_heartbeat.py::test_a_disk_that_moves_where_the_field_is_too_high_takes_the_output_off",
-            "rig/test_guard.py::test_a_voltage_that_the_flat_film_bears_is_refused_on_the_stretched_one",
+            "rig/safety/test_heartbeat.py::test_a_move_is_asked_for_and_a_voltage_is_held_against_where_it_leads",
+            "rig/safety/test_heartbeat.py::test_a_disk_that_moves_where_the_field_is_too_high_takes_the_output_off",
+            "rig/safety/test_guard.py::test_a_voltage_that_the_flat_film_bears_is_refused_on_the_stretched_one",
         ],
     ),
     9: (
@@ -113,7 +113,7 @@ ROWS: dict[int, Row] = {
             "faults/test_limits.py::"
             "test_without_fresh_data_the_stage_stops_within_two_periods_and_the_time_out_and_the_voltage_ramps_down",
             "faults/test_switches.py::test_the_run_ends_as_required",
-            "rig/test_heartbeat.py::test_a_loop_that_beats_on_old_data_is_ramped_down",
+            "rig/safety/test_heartbeat.py::test_a_loop_that_beats_on_old_data_is_ramped_down",
         ],
     ),
     11: (
@@ -130,8 +130,8 @@ ROWS: dict[int, Row] = {
         "a port vanishes at any call",
         "one kind of error, safe, never armed again by itself",
         [
-            "drivers/test_serial_link.py::test_every_way_to_vanish_at_every_call",
-            "drivers/test_can_link.py::test_slcan_that_vanishes_is_lost",
+            "drivers/links/test_serial_link.py::test_every_way_to_vanish_at_every_call",
+            "drivers/links/test_can_link.py::test_slcan_that_vanishes_is_lost",
             "faults/test_switches.py::test_the_run_ends_as_required",
         ],
     ),
@@ -156,9 +156,9 @@ ROWS: dict[int, Row] = {
         "the CAN controller goes bus-off; python-can fails in its own way",
         "the loss of the device; there is no thread that could die unseen",
         [
-            "drivers/test_can_link.py::test_error_frames_are_counted_and_bus_off_is_a_loss",
-            "drivers/test_can_link.py::test_a_controller_that_has_gone_bus_off_is_a_loss_also_without_an_error_frame",
-            "drivers/test_can_link.py::test_a_backend_that_fails_is_a_loss",
+            "drivers/links/test_can_link.py::test_error_frames_are_counted_and_bus_off_is_a_loss",
+            "drivers/links/test_can_link.py::test_a_controller_that_has_gone_bus_off_is_a_loss_also_without_an_error_frame",
+            "drivers/links/test_can_link.py::test_a_backend_that_fails_is_a_loss",
         ],
     ),
     16: (
@@ -178,27 +178,27 @@ ROWS: dict[int, Row] = {
     18: (
         "the power is cut",
         "what had been synced is there, and nothing wrong",
-        ["log/test_power_cut.py::test_power_cuts"],
+        ["rig/log/test_power_cut.py::test_power_cuts"],
     ),
     19: (
         "a log is truncated, or has flipped bits",
         "gaps are listed and flips detected",
-        ["log/test_damage.py::test_cut_anywhere", "log/test_damage.py::test_flip_anywhere"],
+        ["rig/log/test_damage.py::test_cut_anywhere", "rig/log/test_damage.py::test_flip_anywhere"],
     ),
     20: (
         "a hostile log or file of settings",
         "one error of the family, in bounded time and memory; nothing is run",
         [
-            "log/test_damage.py::test_hostile",
-            "log/test_damage.py::test_names_from_a_log_are_data",
-            "rig/test_config_errors.py::test_a_bad_scene_names_file_key_value_and_what_is_allowed",
+            "rig/log/test_damage.py::test_hostile",
+            "rig/log/test_damage.py::test_names_from_a_log_are_data",
+            "rig/scene/test_config_errors.py::test_a_bad_scene_names_file_key_value_and_what_is_allowed",
         ],
     ),
     21: (
         "a certificate is out of date, or another instrument's",
         "told in the log, or refused",
         [
-            "calibration/test_certificate.py::test_expired_not_yet_valid_and_mismatched",
+            "calibration/sensors/test_certificate.py::test_expired_not_yet_valid_and_mismatched",
             "faults/test_run_ends_safe.py::test_a_certificate_of_another_sensor_is_told_in_the_log",
         ],
     ),
@@ -207,7 +207,7 @@ ROWS: dict[int, Row] = {
         "refused; the first one is not disturbed",
         [
             "faults/test_processes.py::test_a_second_run_on_the_same_ports_is_refused_and_disturbs_nothing",
-            "drivers/test_serial_link.py::test_lock_of_another_process_holds_until_it_is_killed",
+            "drivers/links/test_serial_link.py::test_lock_of_another_process_holds_until_it_is_killed",
         ],
     ),
     23: (

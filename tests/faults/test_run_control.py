@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from rig.control import Control
-from rig.errors import FaultError, Stopped
+from rig.base.errors import FaultError, Stopped
 from rig.log.dataset import load_run
 from rig.log.reader import read_log
+from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
 
 Tell = Callable[..., Any]  # of conftest.Story

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from drivers.link import DeviceLost
-from rig.control import Control
-from rig.errors import ConfigError, FaultError, LimitError, Stopped
+from drivers.links.link import DeviceLost
+from rig.base.errors import ConfigError, FaultError, LimitError, Stopped
 from rig.log import part_file, space
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
+from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault
 
@@ -107,7 +107,7 @@ def test_a_driver_with_a_mistake_of_ours_does_not_keep_the_voltage_on(
     def broken(self: object, now: float) -> None:
         raise TypeError("a mistake")
 
-    story = tell(lambda bench, stop: monkeypatch.setattr(f"drivers.{driver}.poll", broken))
+    story = tell(lambda bench, stop: monkeypatch.setattr(f"drivers.instruments.{driver}.poll", broken))
     assert isinstance(story.error, TypeError) and story.outcome.status == "fault"
     assert abs(story.final_output) < 60 and story.outcome.safe and story.off_after < AT_ONCE_S
     assert "internal error" in read_log(story.log).outcome["reason"]  # type: ignore[index]

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from rig.bench import simulated_bench
+from rig.bench.bench import simulated_bench
 from rig.benchmark.stand import PROTOCOL
-from rig.scene import load_scene
+from rig.scene.scene import load_scene
 from rig.sim.served import ServedBench
 
 pytestmark = [

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 
 import pytest
 
-from drivers.keyence_lkg import KeyenceLKG
-from drivers.link import DeviceError, DeviceRefused, DeviceSilent
+from drivers.instruments.keyence_lkg import KeyenceLKG
+from drivers.instruments.zaber import ZaberStage
+from drivers.links.link import DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import DisplacementSample, SampleFlag, StageSample
-from drivers.zaber import ZaberStage
-from model.materials import NAMED
+from model.material.materials import NAMED
 from model.specimen import Specimen
-from rig.clock import VirtualClock
-from rig.memory_link import MemoryByteLink
+from rig.base.clock import VirtualClock
+from rig.bench.memory_link import MemoryByteLink
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import Fault, SimulationSettings, StageTruth
 from rig.sim.wire import ByteWire

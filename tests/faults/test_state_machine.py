@@ -25,18 +25,18 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from drivers.iseg_edcp import IsegEDCP
-from drivers.link import DeviceError
-from model.membrane import Solution, solve
-from rig.clock import VirtualClock
-from rig.errors import FaultError, LimitError
-from rig.memory_link import MemoryFrameLink
+from drivers.instruments.iseg_edcp import IsegEDCP
+from drivers.links.link import DeviceError
+from model.membrane.solve import Solution, solve
+from rig.base.clock import VirtualClock
+from rig.base.errors import FaultError, LimitError
+from rig.bench.memory_link import MemoryFrameLink
 from rig.safety import limits
 from rig.safety.arming import Arming
 from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limits
-from rig.scene import load_scene
+from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.film import FilmTable
 from rig.sim.settings import Fault

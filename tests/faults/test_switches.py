@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.membrane import solve_many
+from model.membrane.solve import solve_many
 from rig.log.reader import read_log
 from rig.sim.settings import TWINS, Fault
 

@@ -1,0 +1,371 @@
+"""The least-squares problem of one pass: residuals of the reduced curves, and their analytic Jacobian."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.film.curve import Curve
+from calibration.film.reduction import (
+    Block,
+    NodeModel,
+    Selection,
+    chebyshev_nodes,
+    correlation_time,
+    interpolation_matrix,
+    noise_ratio,
+    reduce,
+    reference_voltage,
+)
+from model.material.materials import Material
+from model.membrane.solve import Wrinkling, solve_many
+from model.specimen import Specimen
+
+Array = NDArray[np.float64]
+
+NODES = 8  # of every part of a curve, to begin with
+GIVING = 3  # rounds after which force and giving way agree; each is off by a few per cent of the one before
+TOLERANCE = 1e-7  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
+SHARE_BOUNDS = (1e-6, 100.0)  # positive: so is every mu_n alpha_n, which makes the film stable at any stretch
+EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
+PERMITTIVITY_BOUNDS = (0.5, 200.0)
+INVALID_RESIDUAL = 1e8  # where the membrane has no state; larger than any real residual
+
+
+class IdentificationError(ValueError):
+    """Curves from which nothing can be identified; the message says why."""
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """An error of the rig that is fitted along: what kind, of which run, its prior standard uncertainty, which rows."""
+
+    kind: str  # force_zero, displacement_zero, lag or compliance
+    run: str
+    prior: float
+    rows: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Residuals and Jacobians of S parameter vectors: (S, residuals), (S, residuals, parameters).
+
+    Where the membrane has no state, ``answered`` (S,) is False, residuals are `INVALID_RESIDUAL` and slopes 0.
+    """
+
+    residual: Array
+    jacobian: Array
+    answered: NDArray[np.bool_]
+    states: States
+
+    @property
+    def cost(self) -> Array:
+        """Sums of squares (S,)."""
+        cost: Array = np.einsum("sr,sr->s", self.residual, self.residual)
+        return cost
+
+
+class Problem:
+    """Residuals and Jacobian of one pass, with the choice of samples and their weights fixed.
+
+    The parameter vector ``x`` is ``[g_1..g_N, alpha_1..alpha_N, (eps_r), nuisances...]``; nuisances are in units of
+    their priors. Each part of a curve is a row of ``nodes``, and ``active`` names the curve of each row. The rig gives
+    way by the force of the material ``at``, where its ``compliance`` (m/N, beyond that believed) holds the disk.
+    ``solved`` counts the membrane states that were computed: rows times nodes for an evaluation, whatever the number
+    of samples.
+    """
+
+    def __init__(
+        self,
+        curves: Sequence[Curve],
+        selections: Sequence[Selection],
+        terms: int,
+        at: Material,
+        *,
+        trust_noise: bool = False,
+        nodes: int = NODES,
+        tolerance: float = TOLERANCE,
+        wrinkling: Wrinkling = "plain",
+        compliance: float = 0.0,
+    ) -> None:
+        self.curves = curves
+        self.selections = selections
+        self.terms = terms
+        self.material = at
+        self.scale = at.shear_modulus
+        self.tolerance = tolerance
+        self.wrinkling: Wrinkling = wrinkling
+        self.solved = 0
+        self.parts = [(i, part) for i, selection in enumerate(selections) for part in selection.parts]
+        self.active = [i for i, _ in self.parts]
+        if not self.active:
+            raise IdentificationError(
+                "no sample is left to fit: "
+                + "; ".join(_why_empty(c, s) for c, s in zip(curves, selections, strict=True))
+            )
+        self.electric = any(curves[i].nominal_voltage != 0.0 for i in self.active)
+        self.nodes = np.array([chebyshev_nodes(part.low, part.high, nodes) for _, part in self.parts])
+        self.voltage = np.array([reference_voltage(curves[i], part.used) for i, part in self.parts])
+        self.nuisances = self._nuisances()
+        self.names = [f"g{n + 1}" for n in range(terms)] + [f"alpha{n + 1}" for n in range(terms)]
+        self.names += ["eps_r"] if self.electric else []
+        self.film_parameters = len(self.names)
+        self.names += [f"{nuisance.kind}_{k}" for k, nuisance in enumerate(self.nuisances)]
+
+        self._give = np.zeros_like(self.nodes)  # force (N) by which the rig gives way at the nodes
+        x = np.zeros(len(self.names))
+        for k, one in enumerate(self.nuisances, start=self.film_parameters):
+            x[k] = compliance / one.prior if one.kind == "compliance" else 0.0
+        for _ in range(GIVING if x[self.film_parameters :].any() else 1):
+            states = self._solve([at], self._shift(x[None]))[0]
+            self._give = states.force
+        if not np.isfinite(states.force).all():
+            raise IdentificationError("the membrane has no state at the starting guess, where its status says it has")
+        self.blocks: list[Block] = []
+        self.block_rows: list[int] = []
+        for row, (i, part) in enumerate(self.parts):
+            model = NodeModel(states.force[row], states.by["h"][row], states.by["voltage"][row])
+            new = reduce(curves[i], part.used, self.nodes[row], float(self.voltage[row]), model)
+            self.blocks += new
+            self.block_rows += [row] * len(new)
+        ratio, freedom = noise_ratio(self.blocks)
+        self.noise_variance = ratio
+        # Only a significant excess counts: with few samples the ratio is itself a matter of chance.
+        significant = freedom > 0 and ratio > 1.0 + 3.0 * math.sqrt(2.0 / freedom)
+        self.excess = ratio if significant and not trust_noise else 1.0
+        self.correlation_time = 1.0 if trust_noise else correlation_time(self.blocks)
+        self.inflation = self.excess * self.correlation_time
+        self.roots = [block.root / math.sqrt(self.inflation) for block in self.blocks]
+        self.ways = [block.way for block in self.blocks]
+        self._target = np.concatenate([block.target for block in self.blocks]) / math.sqrt(self.inflation)
+        self._stiffness = states.by["h"]  # N/m, at the nodes
+        self._late = {k: self._by_lag(one) for k, one in enumerate(self.nuisances) if one.kind == "lag"}
+        self._last: tuple[bytes, Evaluation] | None = None
+
+    def _nuisances(self) -> list[Nuisance]:
+        found = []
+        for run in dict.fromkeys(self.curves[i].run for i in self.active):
+            rows = tuple(row for row, i in enumerate(self.active) if self.curves[i].run == run)
+            for kind, prior_of in (
+                ("force_zero", "force_zero"),
+                ("displacement_zero", "displacement_zero"),
+                ("lag", "lag_uncertainty"),
+            ):
+                prior = max(getattr(self.curves[self.active[row]], prior_of) for row in rows)
+                if prior > 0.0:
+                    found.append(Nuisance(kind, run, prior, rows))
+        rows = tuple(row for row, i in enumerate(self.active) if self.curves[i].compliance_uncertainty > 0.0)
+        if rows:
+            prior = max(self.curves[self.active[row]].compliance_uncertainty for row in rows)
+            found.append(Nuisance("compliance", "the rig", prior, rows))
+        return found
+
+    @property
+    def data_rows(self) -> int:
+        """Residuals that come from data; one for each nuisance follows."""
+        return self._target.size
+
+    def film(self, x: Array) -> Material:
+        """The material of a parameter vector."""
+        n = self.terms
+        mu = 2.0 * self.scale * x[:n] / x[n : 2 * n]
+        eps_r = float(x[2 * n]) if self.electric else self.material.eps_r
+        return Material(name="identified", mu=tuple(mu), alpha=tuple(x[n : 2 * n]), eps_r=eps_r)
+
+    def vector(self, material: Material) -> Array:
+        """The parameter vector of a material, nuisances at zero."""
+        mu, alpha = np.array(material.mu), np.array(material.alpha)
+        eps = [material.eps_r] if self.electric else []
+        return np.concatenate((mu * alpha / (2.0 * self.scale), alpha, eps, np.zeros(len(self.nuisances))))
+
+    def bounds(self, x: Array) -> tuple[Array, Array]:
+        """Lower and upper bounds of a parameter vector; exponents keep the sign they have in ``x``."""
+        n = self.terms
+        lower, upper = np.full(x.size, -np.inf), np.full(x.size, np.inf)
+        lower[:n], upper[:n] = SHARE_BOUNDS
+        negative = x[n : 2 * n] < 0.0
+        lower[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[1], EXPONENT_BOUNDS[0])
+        upper[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[0], EXPONENT_BOUNDS[1])
+        if self.electric:
+            lower[2 * n], upper[2 * n] = PERMITTIVITY_BOUNDS
+        return lower, upper
+
+    def by_parameters(self, x: Array, by_mu: Array, by_alpha: Array, by_eps: Array) -> Array:
+        """Derivatives by x (..., P) from those by mu, alpha (both (..., N)) and eps_r (...); nuisances get 0."""
+        n = self.terms
+        alpha = x[..., n : 2 * n]
+        mu = 2.0 * self.scale * x[..., :n] / alpha
+        parts = [by_mu * 2.0 * self.scale / alpha, by_alpha - by_mu * mu / alpha]
+        if self.electric:
+            parts.append(by_eps[..., None])
+        parts.append(np.zeros((*by_mu.shape[:-1], len(self.nuisances))))
+        return np.concatenate(parts, axis=-1)
+
+    def residual(self, x: Array) -> Array:
+        """Weighted residuals, model minus measurement: reduced data, then nuisances in units of their priors."""
+        residual: Array = self._one(x).residual[0]
+        return residual
+
+    def jacobian(self, x: Array) -> Array:
+        """Derivatives of `residual` by x, shape (residuals, parameters)."""
+        jacobian: Array = self._one(x).jacobian[0]
+        return jacobian
+
+    def answers(self, x: Array) -> bool:
+        """Whether the membrane has a state at every node for these parameters."""
+        return bool(self._one(x).answered[0])
+
+    def states(self, x: Array) -> States:
+        """The model at the nodes, errors of the displacement included and force zeros not."""
+        return self._one(x).states[0]
+
+    def at_rest(self, x: Array) -> Array:
+        """The model's force at the nodes at 0 V; where there is none, that at the curves' own voltages."""
+        specimens = np.empty((len(self.active), 1), dtype=np.object_)
+        specimens[:, 0] = [self.curves[i].specimen.with_material(self.film(x)) for i in self.active]
+        force = solve_many(specimens, self.nodes, tolerance=self.tolerance).force
+        return np.where(np.isfinite(force), force, self.states(x).force)
+
+    def project(self, at_nodes: Array) -> Array:
+        """Weighted residual rows of changes of the force at the nodes, (..., rows, nodes, P); nuisances get 0."""
+        rows = [root @ at_nodes[..., row, :, :] for root, row in zip(self.roots, self.block_rows, strict=True)]
+        nothing = np.zeros((*at_nodes.shape[:-3], len(self.nuisances), at_nodes.shape[-1]))
+        return np.concatenate([*rows, nothing], axis=-2)
+
+    def evaluate(self, points: Array, *, slopes: bool = True) -> Evaluation:
+        """Residuals and Jacobians of many parameter vectors (S, P), their membrane states all solved together."""
+        count, data = len(points), self.data_rows
+        solved = self._solve([self.film(x) for x in points], self._shift(points), slopes=slopes)
+        force = solved.force.copy()
+        for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
+            if nuisance.kind == "force_zero":
+                force[:, nuisance.rows] += (points[:, k] * nuisance.prior)[:, None, None]
+        residual = self.project(force[..., None])[..., 0]
+        residual[:, :data] -= self._target
+        for k, late in self._late.items():
+            residual[:, :data] += points[:, self.film_parameters + k, None] * late
+        residual[:, data:] = points[:, self.film_parameters :]
+        jacobian = np.zeros((count, residual.shape[1], points.shape[1]))
+        if slopes:
+            by = self.by_parameters(points[:, None, None], *(solved.by[name] for name in ("mu", "alpha", "eps_r")))
+            for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
+                if nuisance.kind != "lag":
+                    by[..., k][:, list(nuisance.rows)] = self._by_nuisance(nuisance, solved)
+            jacobian = self.project(by)
+            for k, late in self._late.items():
+                jacobian[:, :data, self.film_parameters + k] = late
+            jacobian[:, data:, self.film_parameters :] = np.eye(len(self.nuisances))
+        answered = np.asarray(np.isfinite(force).all(axis=(1, 2)))
+        residual[~answered] = INVALID_RESIDUAL
+        jacobian[~answered] = 0.0
+        return Evaluation(residual, jacobian, answered, solved)
+
+    def samples(self, row: int, x: Array, states: States) -> tuple[Array, Array, Array]:
+        """Of the used samples of a row: residual (measured minus model, N), its deviation, displacement."""
+        i, part = self.parts[row]
+        curve, used = self.curves[i], part.used
+        matrix = interpolation_matrix(self.nodes[row], curve.place[used])
+        model = matrix @ states.force[row]
+        for value, nuisance in zip(x[self.film_parameters :], self.nuisances, strict=True):
+            if nuisance.kind == "force_zero" and row in nuisance.rows:
+                model += value * nuisance.prior
+            elif nuisance.kind == "lag" and row in nuisance.rows:
+                model -= value * nuisance.prior * curve.velocity[used] * (matrix @ self._stiffness[row])
+        reference = float(self.voltage[row])
+        if reference > 0.0:
+            by_square = states.by["voltage"][row] / (2 * reference)
+            model += matrix @ by_square * (curve.voltage[used] ** 2 - reference**2)
+        sigma = np.hypot(curve.force_noise, matrix @ states.by["h"][row] * curve.displacement_noise)
+        return curve.force[used] - model, sigma, curve.h[used]
+
+    def interpolation_error(self, states: States) -> Array:
+        """Estimated error (N) of the interpolant of each row: what the last two of its Chebyshev terms amount to."""
+        count = self.nodes.shape[1]
+        angle = (2 * np.arange(count) + 1) * np.pi / (2 * count)
+        last = np.array([np.cos(k * angle) for k in (count - 1, count - 2)]) * 2.0 / count
+        found: Array = np.abs(states.force @ last.T).max(axis=1)
+        return found
+
+    def _by_nuisance(self, nuisance: Nuisance, solved: States) -> Array:
+        rows = list(nuisance.rows)
+        if nuisance.kind == "force_zero":
+            return np.full((len(solved.force), len(rows), self.nodes.shape[1]), nuisance.prior)
+        slope = nuisance.prior * solved.by["h"][:, rows]
+        return slope if nuisance.kind == "displacement_zero" else -slope * self._give[rows]
+
+    def _by_lag(self, lag: Nuisance) -> Array:
+        """What force that is one prior too late does to the weighted residual rows: it is that of where the disk was.
+
+        Every sample has its own velocity, and so this passes by the nodes.
+        """
+        late = []
+        for block, row in zip(self.blocks, self.block_rows, strict=True):
+            curve = self.curves[self.active[row]]
+            slope = interpolation_matrix(self.nodes[row], curve.place[block.rows]) @ self._stiffness[row]
+            change = -lag.prior * curve.velocity[block.rows] * slope * (row in lag.rows)
+            late.append((change / block.sigma) @ block.base)
+        return np.concatenate(late) / math.sqrt(self.inflation)
+
+    def _shift(self, points: Array) -> Array:
+        """What the errors of the displacement add to the nodes (m), shape (S, rows, nodes)."""
+        shift = np.zeros((len(points), *self.nodes.shape))
+        for values, nuisance in zip(points.T[self.film_parameters :], self.nuisances, strict=True):
+            rows = list(nuisance.rows)
+            size = (values * nuisance.prior)[:, None, None]
+            if nuisance.kind == "displacement_zero":
+                shift[:, rows] += size
+            elif nuisance.kind == "compliance":
+                shift[:, rows] -= size * self._give[rows]
+        return shift
+
+    def _one(self, x: Array) -> Evaluation:
+        key = x.tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = (key, self.evaluate(x[None]))
+        return self._last[1]
+
+    def _solve(self, materials: Sequence[Material], shift: Array, *, slopes: bool = True) -> States:
+        specimens = np.empty((len(materials), len(self.active), 1), dtype=np.object_)
+        known: dict[tuple[int, int], Specimen] = {}  # the curves of one specimen share it, so that its numbers are once
+        for s, material in enumerate(materials):
+            for row, i in enumerate(self.active):
+                here = self.curves[i].specimen
+                key = (s, id(here))
+                if key not in known:
+                    known[key] = here.with_material(material)
+                specimens[s, row, 0] = known[key]
+        solved = solve_many(
+            specimens,
+            self.nodes + shift,
+            self.voltage[:, None],
+            tolerance=self.tolerance,
+            wrinkling=self.wrinkling,
+            sensitivities=slopes,
+        )
+        self.solved += solved.force.size
+        return States(solved.force, solved.dforce or {}, solved.max_stretch)
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """The model at the nodes: arrays of shape (rows, nodes), by mu and alpha (rows, nodes, N), or with S before.
+
+    ``by`` holds the derivatives of the force, with the keys of `model.membrane.solve.Solutions.dforce`.
+    """
+
+    force: Array
+    by: dict[str, Array]
+    max_stretch: Array
+
+    def __getitem__(self, index: int) -> States:
+        by = {name: values[index] for name, values in self.by.items()}
+        return States(self.force[index], by, self.max_stretch[index])
+
+
+def _why_empty(curve: Curve, selection: Selection) -> str:
+    reasons = ", ".join(f"{count} {reason}" for reason, count in selection.excluded.items())
+    return f"{curve.label}: {reasons or 'no samples'}"

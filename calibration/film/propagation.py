@@ -1,0 +1,361 @@
+"""From a minimum to uncertainties: linear propagation of noise, zeros, gains and dimensions to what is stated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.film.curve import Curve
+from calibration.film.misfit import Suspect
+from calibration.film.problem import EXPONENT_BOUNDS, Problem
+from calibration.film.result import Quantity, Stiffness, Zero, verdict
+from model.material.materials import Material
+
+Array = NDArray[np.float64]
+
+# Systematic effects: entry in the budget, the curve's field with its relative standard uncertainty, what it scales.
+SYSTEMATIC = (
+    ("force gain", "force_gain", "force"),
+    ("displacement gain", "displacement_gain", "h"),
+    ("voltage gain", "voltage_gain", "voltage"),
+    ("thickness", "thickness_uncertainty", "thickness"),
+    ("pre-stretch", "prestretch_uncertainty", "prestretch"),
+    ("disk radius", "disk_radius_uncertainty", "disk_radius"),
+)
+
+
+# What is fitted along, and its unit.
+NUISANCES = {"force_zero": "N", "displacement_zero": "m", "lag": "s", "compliance": "m/N"}
+# Standard deviation of an exponent of which no more is known than its range (rectangular: JCGM 100:2008, 4.3.7).
+RANGE = (EXPONENT_BOUNDS[1] - EXPONENT_BOUNDS[0]) / math.sqrt(12.0)
+NEGLIGIBLE = 1e-3  # of the noise: what is less has no line in a budget
+
+
+def stiffening(curve: Curve) -> float:
+    """Relative rise of the force when the disk sits off the ring's centre by the curve's ``eccentricity``.
+
+    A membrane under even tension carries the disk like a field its charge: the stiffness goes with the capacitance of
+    the two circles, ``1/arcosh((a^2 + b^2 - e^2)/(2 a b))``. It can only rise; the rise is taken as its uncertainty.
+    """
+    a, b, e = curve.specimen.disk_radius, curve.specimen.ring_radius, curve.eccentricity
+    return math.log(b / a) / math.acosh((a * a + b * b - e * e) / (2.0 * a * b)) - 1.0 if e > 0.0 else 0.0
+
+
+def secant_modulus(material: Material, meridional: float, hoop: float) -> float:
+    r"""Shear modulus (Pa) of the neo-Hookean film with the same meridional stress at these stretches.
+
+    .. math:: G_s = \frac{\sum_n \mu_n (l_1^{\alpha_n} - (l_1 l_2)^{-\alpha_n})}{l_1^2 - (l_1 l_2)^{-2}}
+
+    It is what a force measures, since ``2 pi R (T/lp) S1 sin(theta) = F``. For small strains it becomes ``G``.
+    """
+    mu, alpha = np.array(material.mu), np.array(material.alpha)
+    return float(secant(mu, alpha, np.array([meridional]), hoop)[0][0])
+
+
+def least_tangent(material: Material, meridional: float, hoop: float) -> float:
+    r"""Smallest tangent modulus (Pa) for stretches from 1 to ``meridional`` and ``hoop``; above 0 in a stable film.
+
+    The smaller eigenvalue of the second derivatives of W by the logarithms of the two stretches (Drucker, Hill).
+    With every ``mu_n alpha_n > 0`` it is positive whatever the stretch.
+    """
+    mu, alpha = np.array(material.mu), np.array(material.alpha)
+    one, two = (np.log(np.linspace(1.0, end, 25)) for end in (max(meridional, 1.0), max(hoop, 1.0)))
+    l1, l2 = (grid[..., None] for grid in np.meshgrid(one, two))
+    own1, own2, shared = (np.exp(alpha * power) @ (mu * alpha) for power in (l1, l2, -(l1 + l2)))
+    mean, half = 0.5 * (own1 + own2) + shared, 0.5 * (own1 - own2)
+    return float((mean - np.hypot(half, shared)).min())
+
+
+def secant(mu: Array, alpha: Array, meridional: Array, hoop: float) -> tuple[Array, Array, Array]:
+    """Secant modulus at k meridional stretches, with derivatives by mu and by alpha; shapes (k,), (k, N), (k, N)."""
+    l1 = meridional[:, None]
+    stretch = l1**alpha - (l1 * hoop) ** -alpha
+    by_alpha = mu * (l1**alpha * np.log(l1) + (l1 * hoop) ** -alpha * np.log(l1 * hoop))
+    neo_hookean = l1**2 - (l1 * hoop) ** -2.0
+    return (stretch @ mu) / neo_hookean[:, 0], stretch / neo_hookean, by_alpha / neo_hookean
+
+
+class Covariance:
+    """Linear propagation at a minimum: what an error in the data does to the parameters.
+
+    ``response`` maps weighted residual rows to changes of x: ``-(J^T J)^-1 J^T``. Directions that the data do not see
+    are kept with a tiny singular value, so that their uncertainty comes out huge rather than absent.
+    """
+
+    def __init__(self, jacobian: Array, free: NDArray[np.bool_]) -> None:
+        columns = jacobian.shape[1]
+        jacobian = jacobian[:, free]
+        norms = np.linalg.norm(jacobian, axis=0)
+        norms[norms == 0.0] = 1e-30
+        u, s, vt = np.linalg.svd(jacobian / norms, full_matrices=False)
+        s = np.maximum(s, 1e-13 * s[0])
+        self.response = np.zeros((columns, jacobian.shape[0]))
+        self.response[free] = -(vt.T / s) @ u.T / norms[:, None]
+
+    @property
+    def matrix(self) -> Array:
+        """Covariance of x for unit variance of every residual."""
+        matrix: Array = self.response @ self.response.T
+        return matrix
+
+
+class Propagation:
+    """Standard uncertainties of functions of the film's parameters, part by part.
+
+    ``misfit`` is the chi-square of the lack of fit over its expectation; ``rivals`` are other minima with their
+    likelihood relative to this one; ``doubts`` are imperfections, of which the first biases the result if it is there.
+    With ``ranges`` it counts as knowledge that exponents lie in their range. Of an exponent that the data do not
+    determine the curvature says far more than is possible, and with it of all that is derived from it.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        x: Array,
+        free: NDArray[np.bool_],
+        misfit: float,
+        rivals: Sequence[tuple[Material, float]],
+        doubts: Sequence[Suspect],
+        *,
+        ranges: bool = False,
+    ) -> None:
+        self.problem = problem
+        self.film = problem.film(x)
+        jacobian = problem.jacobian(x)
+        known = np.eye(problem.terms, x.size, problem.terms) / RANGE if ranges else np.empty((0, x.size))
+        self.covariance = Covariance(np.concatenate((jacobian, known)), free)
+        self.response = self.covariance.response[:, : len(jacobian)]
+        self.misfit = misfit
+        self.doubts = doubts
+        self.bias: Array | None = None
+        for guilty in doubts[:1]:
+            if guilty.significant:
+                self.bias = self.response @ (guilty.amplitude * guilty.shape)
+        self.rivals = rivals
+        self.effects: dict[str, Array] = {}
+        states = problem.states(x)
+        for part, uncertainty, scales in SYSTEMATIC:
+            relative = np.array([getattr(problem.curves[i], uncertainty) for i in problem.active])[:, None]
+            if relative.any():
+                change = states.force if scales == "force" else states.by[scales] * self._size(scales)
+                self.effects[part] = self.response @ problem.project((relative * change)[..., None])[:, 0]
+        tilted = np.array([stiffening(problem.curves[i]) for i in problem.active])[:, None]
+        if tilted.any():
+            shift = problem.project((tilted * states.force)[..., None])[:, 0]
+            self.effects["eccentricity"] = self.response @ shift
+
+    def _size(self, name: str) -> Array:
+        """Displacement, voltage or a dimension of the specimen at the nodes of every active curve."""
+        if name == "h":
+            return self.problem.nodes
+        if name == "voltage":
+            return self.problem.voltage[:, None]
+        return np.array([[getattr(self.problem.curves[i].specimen, name)] for i in self.problem.active])
+
+    def quantity(
+        self, of: Callable[[Material], float], gradient: Array, unit: str, *, at_bound: bool = False, known: bool = True
+    ) -> Quantity:
+        """``of(film)``, whose gradient by x is given; ``known=False`` when nothing in the data bears on it."""
+        value = of(self.film)
+        budget = self.budget(gradient)
+        weights = 1.0 + sum(weight for _, weight in self.rivals)
+        spread = sum(weight * (of(film) - value) ** 2 for film, weight in self.rivals) / weights
+        # Minima in one valley are described by its curvature already; only what goes beyond that is added.
+        if spread > budget["noise"] ** 2:
+            budget["other solutions"] = math.sqrt(spread - budget["noise"] ** 2)
+        total = math.hypot(*budget.values()) if known else math.inf
+        relative = total / abs(value) if value else math.inf
+        return Quantity(value, total, unit, budget, verdict(relative, at_bound), at_bound)
+
+    def unseen(self, gradients: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+        """By how much each imperfection may shift functions of x before it would be reported."""
+        # The shape is what it would do to the model; the data have it and the model has not.
+        shifts = {one.name: self.response @ (-one.shows_from * one.shape) for one in self.doubts}
+        return {
+            doubt: {name: float(gradient @ shift) for name, gradient in gradients.items()}
+            for doubt, shift in shifts.items()
+        }
+
+    def covariances(self, gradients: Array) -> Array:
+        """Covariance matrix of functions of x with these gradients, by all parts that propagate linearly."""
+        total: Array = gradients @ self.covariance.matrix @ gradients.T * self.misfit
+        for effect in (*self.effects.values(), *(() if self.bias is None else (self.bias,))):
+            change = gradients @ effect
+            total = total + np.outer(change, change)
+        return total
+
+    def budget(self, gradient: Array) -> dict[str, float]:
+        """Independent parts of the standard uncertainty of a function of x with this gradient."""
+        rows = gradient @ self.covariance.response
+        data = self.problem.data_rows
+        parts = {"noise": float(np.linalg.norm(rows[:data]))}
+        for kind in NUISANCES:
+            mine = [data + k for k, nuisance in enumerate(self.problem.nuisances) if nuisance.kind == kind]
+            if mine:
+                parts[kind.replace("_", " ")] = float(np.linalg.norm(rows[mine]))
+        unknown = float(np.linalg.norm(rows[self.response.shape[1] :]))
+        if unknown > NEGLIGIBLE * parts["noise"]:
+            parts["range of exponents"] = unknown
+        bias = 0.0 if self.bias is None else float(gradient @ self.bias)
+        if self.misfit > 1.0 or self.bias is not None:
+            parts["lack of fit"] = math.hypot(parts["noise"] * math.sqrt(max(0.0, self.misfit - 1.0)), bias)
+        for part, effect in self.effects.items():
+            parts[part] = abs(float(gradient @ effect))
+        return parts
+
+
+def determined(problem: Problem, at_bound: NDArray[np.bool_], held: Collection[str]) -> NDArray[np.bool_]:
+    """Entries of x that the data bear on: not held, and not the exponent of a term without stiffness."""
+    n = problem.terms
+    free = np.array([name not in held for name in problem.names])
+    free[n : 2 * n] &= ~at_bound[:n]
+    return free
+
+
+@dataclass(frozen=True, eq=False)
+class Statement:
+    """Everything that is derived from a minimum by linear propagation."""
+
+    quantities: dict[str, Quantity]
+    nuisance: dict[str, Zero]
+    stretch: tuple[float, float]
+    stiffness_curve: Stiffness
+    along: list[Quantity]  # the same, with their budgets
+    parameters: list[str]
+    correlation: list[list[float]]
+    covariance: list[list[float]]
+    condition: float
+    unseen: dict[str, dict[str, float]]  # shift of stiffness and permittivity by each suspect that does not show yet
+
+
+def state(
+    problem: Problem,
+    x: Array,
+    at_bound: NDArray[np.bool_],
+    held: Collection[str],
+    *,
+    misfit: float = 1.0,
+    rivals: Sequence[tuple[Material, float]] = (),
+    doubts: Sequence[Suspect] = (),
+    ranges: bool = False,
+) -> Statement:
+    """Quantities with uncertainties at ``x``; ``at_bound`` marks entries of x, ``held`` names those that were given.
+
+    ``doubts`` are the imperfections that the residuals were held against (`calibration.film.misfit`), most probable
+    first.
+    If that one was found, what it does to the results is part of their uncertainty. With ``ranges`` the shear modulus
+    and the permittivity count on exponents being in their range. The terms, and the stiffness at stretches that were
+    reached, stand as the data alone have them.
+    """
+    n = problem.terms
+    vanished = at_bound[:n]
+    free = determined(problem, at_bound, held)
+    propagation = Propagation(problem, x, free, misfit, rivals, doubts)
+    derived = Propagation(problem, x, free, misfit, rivals, doubts, ranges=True) if ranges else propagation
+    film = propagation.film
+    mu, alpha = np.array(film.mu), np.array(film.alpha)
+    zero, unit = np.zeros(n), np.eye(n)
+
+    def gradient(by_mu: Array, by_alpha: Array, by_eps: float = 0.0) -> Array:
+        return problem.by_parameters(x, by_mu, by_alpha, np.array(by_eps))
+
+    quantities: dict[str, Quantity] = {}
+    slopes: dict[str, Array] = {}
+    for k in range(n):
+        name = f"mu{k + 1}"
+        slopes[name] = gradient(unit[k], zero)
+        quantities[name] = propagation.quantity(
+            partial(_entry, "mu", k), slopes[name], "Pa", at_bound=bool(vanished[k])
+        )
+        name = f"alpha{k + 1}"
+        if name not in held:
+            slopes[name] = gradient(zero, unit[k])
+            quantities[name] = propagation.quantity(
+                partial(_entry, "alpha", k),
+                slopes[name],
+                "1",
+                at_bound=bool(vanished[k] or at_bound[n + k]),
+                known=not vanished[k],
+            )
+    quantities["G"] = derived.quantity(lambda m: m.shear_modulus, gradient(alpha / 2.0, mu / 2.0), "Pa")
+
+    hoop = float(np.mean([problem.curves[i].specimen.prestretch for i in problem.active]))
+    longest = max(float(problem.states(x).max_stretch.max()), hoop + 0.02)
+    stretches = np.arange(math.floor(hoop * 100) + 1, math.floor(longest * 100) + 1) / 100
+    _, by_mu, by_alpha = secant(mu, alpha, stretches, hoop)
+    along = [
+        propagation.quantity(partial(secant_modulus, meridional=stretch, hoop=hoop), gradient(a, b), "Pa")
+        for stretch, a, b in zip(stretches, by_mu, by_alpha, strict=True)
+    ]
+    at = min(range(len(along)), key=lambda k: along[k].relative)
+    quantities["stiffness"] = along[at]
+    quantities["stiffness_end"] = along[-1]
+    if problem.electric and "eps_r" not in held:
+        slopes["eps_r"] = gradient(zero, zero, 1.0)
+        quantities["eps_r"] = derived.quantity(lambda m: m.eps_r, slopes["eps_r"], "1", at_bound=bool(at_bound[2 * n]))
+
+    told = {"stiffness": gradient(by_mu[at], by_alpha[at]), **({"eps_r": slopes["eps_r"]} if "eps_r" in slopes else {})}
+
+    if vanished.any():  # what is left is another model: its terms are not those that were asked for
+        lost = [name for name in quantities if name.startswith(("mu", "alpha"))]
+        quantities |= {name: replace(quantities[name], verdict=verdict(math.inf, True)) for name in lost}
+
+    nuisance = {}
+    for k, one in enumerate(problem.nuisances, start=problem.film_parameters):
+        slope = np.zeros(x.size)
+        slope[k] = one.prior
+        nuisance[f"{one.kind.replace('_', ' ')} of {one.run}"] = Zero(
+            value=float(x[k] * one.prior),
+            uncertainty=math.hypot(*propagation.budget(slope).values()),
+            prior=one.prior,
+            unit=NUISANCES[one.kind],
+        )
+    return Statement(
+        quantities=quantities,
+        nuisance=nuisance,
+        stretch=(float(stretches[at]), hoop),
+        stiffness_curve=Stiffness(
+            meridional_stretch=tuple(float(value) for value in stretches),
+            hoop_stretch=hoop,
+            secant_modulus=tuple(q.value for q in along),
+            uncertainty=tuple(q.uncertainty for q in along),
+        ),
+        along=along,
+        parameters=list(slopes),
+        correlation=_correlation(np.array(list(slopes.values())), propagation.covariance.matrix),
+        covariance=propagation.covariances(np.array(list(slopes.values()))).tolist(),
+        condition=_condition(problem, x, free),
+        unseen=derived.unseen(told),
+    )
+
+
+def _entry(name: str, k: int, film: Material) -> float:
+    return float(getattr(film, name)[k])
+
+
+def _correlation(slopes: Array, covariance: Array) -> list[list[float]]:
+    """Correlation matrix of functions of x with these gradients; 0 beside a function without uncertainty."""
+    own = slopes @ covariance @ slopes.T
+    deviation = np.sqrt(np.diag(own))
+    deviation[deviation == 0.0] = 1.0
+    matrix = own / np.outer(deviation, deviation)
+    np.fill_diagonal(matrix, 1.0)
+    return [[float(value) for value in row] for row in matrix]
+
+
+def _condition(problem: Problem, x: Array, free: NDArray[np.bool_]) -> float:
+    """Condition number of the Jacobian by relative changes of the film's free parameters, the zeros left free."""
+    jacobian = problem.jacobian(x)
+    film = np.flatnonzero(free[: problem.film_parameters])
+    columns = jacobian[:, film] * x[film]
+    zeros = jacobian[:, problem.film_parameters :]
+    if zeros.shape[1]:
+        base, _ = np.linalg.qr(zeros)
+        columns = columns - base @ (base.T @ columns)
+    s = np.linalg.svd(columns, compute_uv=False)
+    return float(s[0] / s[-1]) if s[-1] > 0.0 else math.inf

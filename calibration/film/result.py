@@ -1,0 +1,328 @@
+"""What identification says about a film, and its form as plain JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from calibration.film.held_out import HeldOut
+from calibration.film.misfit import Suspect
+from model.material.materials import Material
+from model.membrane.solve import Wrinkling
+
+if TYPE_CHECKING:
+    from calibration.film.posterior import Posterior
+
+CONVENTION = "W = sum mu_n/alpha_n (l1^alpha_n + l2^alpha_n + (l1 l2)^-alpha_n - 3), G = 1/2 sum mu_n alpha_n"
+
+
+IDENTIFIED = 0.05  # relative standard uncertainty up to which a quantity counts as identified ...
+WEAKLY_IDENTIFIED = 0.30  # ... and as weakly identified
+
+
+def verdict(relative: float, at_bound: bool) -> str:
+    """What a relative standard uncertainty amounts to; a parameter at its bound is not identified at all."""
+    if relative <= IDENTIFIED and not at_bound:
+        return "identified"
+    if relative <= WEAKLY_IDENTIFIED and not at_bound:
+        return "weakly identified"
+    return "not identifiable from this data"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One identified number.
+
+    ``uncertainty`` is the combined standard uncertainty (k = 1); ``budget`` holds its independent parts, which add in
+    squares. ``verdict`` is "identified", "weakly identified" or "not identifiable from this data". ``interval`` is the
+    95 % interval by profile likelihood, where one was asked for; an end that the data do not set is infinite.
+    """
+
+    value: float
+    uncertainty: float
+    unit: str
+    budget: dict[str, float]
+    verdict: str
+    at_bound: bool = False
+    interval: tuple[float, float] | None = None
+
+    @property
+    def relative(self) -> float:
+        """Uncertainty over value; inf for a value of zero."""
+        return self.uncertainty / abs(self.value) if self.value else math.inf
+
+
+@dataclass(frozen=True)
+class Zero:
+    """An error of the rig that was found with the film's parameters.
+
+    ``prior`` is the standard uncertainty that was stated for it, ``uncertainty`` the one that is left. A force zero
+    is what the force was read too large; a displacement zero what the displacement was read too small. A lag is how far
+    the force was behind the displacement, a compliance what had not been taken off the displacement.
+    """
+
+    value: float
+    uncertainty: float
+    prior: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class CurveResult:
+    """What became of one curve. Residuals are measurement minus model, in newtons."""
+
+    label: str
+    run: str
+    specimen: str
+    nominal_voltage: float
+    samples: int
+    used: int
+    excluded: dict[str, int]
+    wrinkled: int
+    rms_residual: float
+    rms_expected: float
+    lag1_autocorrelation: float
+    mean_residual_loading: float | None
+    mean_residual_unloading: float | None
+    interpolation_error: float
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """Secant shear modulus against meridional stretch, at a hoop stretch equal to the pre-stretch (Pa)."""
+
+    meridional_stretch: tuple[float, ...]
+    hoop_stretch: float
+    secant_modulus: tuple[float, ...]
+    uncertainty: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Everything that a set of curves says about a film.
+
+    Attributes
+    ----------
+    material : Material
+        The film with the identified parameters. Without voltage in the data its ``eps_r`` is the starting guess.
+    quantities : dict of str to Quantity
+        ``mu1``, ``alpha1``, ... sorted by exponent, ``G``, ``stiffness`` and, with voltage in the data, ``eps_r``.
+    stretch : (float, float)
+        Meridional and hoop stretch to which ``stiffness`` belongs; see `secant_modulus`.
+    stiffness_curve : Stiffness
+        The same over the range of stretch that the data reach; its last value is the quantity ``stiffness_end``.
+    least_tangent : float
+        Smallest tangent modulus (Pa) over the stretches reached; positive for a stable film.
+    nuisance : dict of str to Zero
+        Zeros of force (N) and displacement (m) and lag of the force (s) of every run, and the rig's compliance (m/N).
+    chi_square, freedom : float, int
+        Of all samples, in their stated standard deviations.
+    lack_of_fit, lack_of_fit_freedom, lack_of_fit_probability : float, int, float
+        Misfit that smooth curves would not have, in the noise found, and the probability of as much by chance.
+    suspects : list of Suspect
+        Known imperfections whose shape the residuals were held against, most probable first.
+    unseen : dict of str to dict of str to float
+        By how much each of them shifts ``stiffness`` and ``eps_r`` at the size from which on it would be reported.
+    noise_ratio : float
+        Scatter about the nearest smooth curves over the stated standard deviation.
+    samples_per_independent : float
+        1 for independent samples; the fit counts n samples as n over this.
+    parameters, correlation, covariance : list of str, list of list of float, list of list of float
+        Correlations of the raw parameters by noise and zeros; their covariances, in SI units, by all that propagates
+        linearly.
+    condition : float
+        Condition number of the least-squares problem in relative changes of the raw parameters.
+    warnings, advice : list of str
+        What speaks against the result; which further measurement would determine the Ogden terms better.
+    aicc, bic : float
+        Information criteria; smaller is better, differences below 2 mean nothing.
+    held_out : list of HeldOut
+        Predictions of curves from the others, where they were asked for.
+    posterior : Posterior or None
+        What Markov chains say of the same data, where they were asked for.
+    """
+
+    material: Material
+    quantities: dict[str, Quantity]
+    stretch: tuple[float, float]
+    stiffness_curve: Stiffness
+    least_tangent: float
+    nuisance: dict[str, Zero]
+    chi_square: float
+    freedom: int
+    lack_of_fit: float
+    lack_of_fit_freedom: int
+    lack_of_fit_probability: float
+    suspects: list[Suspect]
+    unseen: dict[str, dict[str, float]]
+    noise_ratio: float
+    samples_per_independent: float
+    parameters: list[str]
+    correlation: list[list[float]]
+    covariance: list[list[float]]
+    condition: float
+    aicc: float
+    bic: float
+    curves: list[CurveResult]
+    starts: int
+    starts_agreeing: int
+    warnings: list[str]
+    advice: list[str]
+    provenance: dict[str, Any] = field(default_factory=dict)
+    held_out: list[HeldOut] = field(default_factory=list)
+    posterior: Posterior | None = None
+
+    @property
+    def terms(self) -> int:
+        """Number of Ogden terms."""
+        return len(self.material.mu)
+
+    @property
+    def wrinkling(self) -> Wrinkling:
+        """What became of samples at which the film is wrinkled; see `calibration.film.identify.identify`."""
+        found: Wrinkling = self.provenance.get("settings", {}).get("wrinkling", "plain")
+        return found
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """Chi-square per degree of freedom; near 1 when model and stated noise are right."""
+        return self.chi_square / self.freedom
+
+    @property
+    def used(self) -> int:
+        """Samples in the fit."""
+        return sum(curve.used for curve in self.curves)
+
+    @property
+    def excluded(self) -> int:
+        """Samples left out."""
+        return sum(curve.samples - curve.used for curve in self.curves)
+
+    @property
+    def blind_spots(self) -> list[Suspect]:
+        """Suspects that may shift stiffness or permittivity by more than their uncertainty before they show.
+
+        The most harmful first.
+        """
+
+        def harm(suspect: Suspect) -> float:
+            return max(
+                abs(shift) / self.quantities[name].uncertainty for name, shift in self.unseen[suspect.name].items()
+            )
+
+        return sorted((one for one in self.suspects if harm(one) > 1.0), key=harm, reverse=True)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings, lists and dictionaries; a number that is not finite becomes None."""
+        return {
+            "format": "dea-rig identification 1",
+            "model": "incompressible Ogden film, axisymmetric membrane, ideal dielectric",
+            "convention": CONVENTION,
+            "terms": self.terms,
+            "quantities": {name: quantity_dict(q) for name, q in self.quantities.items()},
+            "stiffness_at": {"meridional_stretch": self.stretch[0], "hoop_stretch": self.stretch[1]},
+            "stiffness_curve": {
+                "meridional_stretch": list(self.stiffness_curve.meridional_stretch),
+                "hoop_stretch": self.stiffness_curve.hoop_stretch,
+                "secant_modulus_Pa": list(self.stiffness_curve.secant_modulus),
+                "standard_uncertainty_Pa": list(self.stiffness_curve.uncertainty),
+            },
+            "least_tangent_modulus_Pa": self.least_tangent,
+            "nuisance": {
+                name: {
+                    "value": zero.value,
+                    "standard_uncertainty": zero.uncertainty,
+                    "stated_standard_uncertainty": zero.prior,
+                    "unit": zero.unit,
+                }
+                for name, zero in self.nuisance.items()
+            },
+            "chi_square": self.chi_square,
+            "degrees_of_freedom": self.freedom,
+            "reduced_chi_square": self.reduced_chi_square,
+            "lack_of_fit": {
+                "chi_square": self.lack_of_fit,
+                "degrees_of_freedom": self.lack_of_fit_freedom,
+                "probability": self.lack_of_fit_probability,
+                "suspects": [
+                    {
+                        "name": one.name,
+                        "amplitude": one.amplitude,
+                        "standard_uncertainty": one.uncertainty,
+                        "unit": one.unit,
+                        "probability": one.probability,
+                        "shows_from": one.shows_from,
+                        "shift_unseen": self.unseen[one.name],
+                        "remedy": one.remedy,
+                    }
+                    for one in self.suspects
+                ],
+            },
+            "noise_ratio": self.noise_ratio,
+            "samples_per_independent_sample": self.samples_per_independent,
+            "samples_used": self.used,
+            "samples_excluded": self.excluded,
+            "parameters": self.parameters,
+            "correlation": self.correlation,
+            "covariance": self.covariance,
+            "condition_number": _finite(self.condition),
+            "aicc": self.aicc,
+            "bic": self.bic,
+            "held_out": [
+                {"what": one.what, "rms_residual_N": one.rms_residual, "rms_expected_N": one.rms_expected}
+                for one in self.held_out
+            ],
+            "starts": self.starts,
+            "starts_agreeing": self.starts_agreeing,
+            "curves": [
+                {
+                    "label": c.label,
+                    "run": c.run,
+                    "specimen": c.specimen,
+                    "nominal_voltage_V": c.nominal_voltage,
+                    "samples": c.samples,
+                    "samples_used": c.used,
+                    "excluded": c.excluded,
+                    "wrinkled": c.wrinkled,
+                    "rms_residual_N": _finite(c.rms_residual),
+                    "rms_expected_N": _finite(c.rms_expected),
+                    "lag1_autocorrelation": _finite(c.lag1_autocorrelation),
+                    "mean_residual_loading_N": c.mean_residual_loading,
+                    "mean_residual_unloading_N": c.mean_residual_unloading,
+                    "interpolation_error_N": _finite(c.interpolation_error),
+                }
+                for c in self.curves
+            ],
+            **({"posterior": self.posterior.to_dict()} if self.posterior is not None else {}),
+            "warnings": self.warnings,
+            "advice": self.advice,
+            "provenance": self.provenance,
+        }
+
+    def to_json(self, comparison: Sequence[Identification] = ()) -> str:
+        """`to_dict` as JSON text, with what a ``comparison`` of several numbers of terms says beside it."""
+        values = self.to_dict()
+        if comparison:
+            values["comparison"] = [
+                {name: one.to_dict()[name] for name in ("terms", "aicc", "bic", "held_out")} for one in comparison
+            ]
+        return json.dumps(values, indent=2, allow_nan=False) + "\n"
+
+
+def quantity_dict(quantity: Quantity) -> dict[str, Any]:
+    return {
+        "value": _finite(quantity.value),
+        "standard_uncertainty": _finite(quantity.uncertainty),
+        "unit": quantity.unit,
+        "budget": {part: _finite(value) for part, value in quantity.budget.items()},
+        "verdict": quantity.verdict,
+        "at_bound": quantity.at_bound,
+        "interval_95": None if quantity.interval is None else [_finite(end) for end in quantity.interval],
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,433 @@
+r"""Ogden parameters from homogeneous tests: uniaxial, equibiaxial, pure shear, general biaxial.
+
+In the plane of the sheet, incompressible and free on its faces, the nominal stress along direction i is
+
+.. math:: P_i = \frac{1}{l_i} \sum_n \mu_n (l_i^{\alpha_n} - (l_1 l_2)^{-\alpha_n})
+
+with ``l2 = l1**-0.5`` in a uniaxial test, ``l2 = l1`` in an equibiaxial one and ``l2 = 1`` in pure shear.
+
+A test is a CSV file. Lines that begin with ``#`` are remarks; one of them may say ``# kind: uniaxial`` (or equibiaxial,
+pure shear, biaxial), else the file's name must. Columns are ``stretch, nominal_stress_MPa`` (or ``_kPa``, ``_Pa``), for
+biaxial tests ``stretch1, stretch2, nominal_stress1_MPa, nominal_stress2_MPa``.
+
+Convention of the Ogden terms: `model.material.materials.Material`.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import warnings as python_warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.film.result import CONVENTION, Quantity, quantity_dict, verdict
+
+Array = NDArray[np.float64]
+
+Weighting = Literal["balanced", "relative"]
+
+KINDS = (
+    "equibiaxial",
+    "biaxial",
+    "uniaxial",
+    "pure shear",
+)  # a name with "equibiaxial" holds "biaxial" too: in this order
+UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
+LARGEST_BYTES = 4 * 1024 * 1024
+SHARE_BOUNDS = (1e-8, 10.0)
+EXPONENT_BOUNDS = (0.05, 30.0)  # of |alpha|
+SAME_MINIMUM = 1.0  # chi-square, in units of the scatter about the best fit, by which minima count as equally good
+
+
+class TestsError(ValueError):
+    """A test that cannot be read or fitted; the message names the file and what is wrong."""
+
+    __test__ = False  # not a test class, whatever its name suggests to pytest
+
+
+@dataclass(frozen=True, eq=False)
+class HomogeneousTest:
+    """Stretches and nominal stresses (Pa) of one test; ``stress2`` is nan where only the first was measured."""
+
+    name: str
+    kind: str
+    stretch1: Array
+    stretch2: Array
+    stress1: Array
+    stress2: Array
+
+    @property
+    def measured(self) -> Array:
+        """All measured stresses, those along the first direction first."""
+        both = np.concatenate((self.stress1, self.stress2))
+        return both[np.isfinite(both)]
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Ogden terms, sorted by exponent, and the weighted sum of squares they leave."""
+
+    mu: tuple[float, ...]
+    alpha: tuple[float, ...]
+    cost: float
+
+
+@dataclass(frozen=True)
+class TestsFit:
+    """Ogden terms that fit a set of tests.
+
+    ``quantities`` holds ``mu1``, ``alpha1``, ... and ``G``, with standard uncertainties from the scatter about the fit.
+    ``r_squared`` is the share of each fitted test's variance that the model explains, ``prediction`` the same for tests
+    that took no part. ``others`` are further minima that fit equally well.
+    """
+
+    __test__ = False
+
+    mu: tuple[float, ...]
+    alpha: tuple[float, ...]
+    quantities: dict[str, Quantity]
+    r_squared: dict[str, float]
+    prediction: dict[str, float]
+    residuals: dict[str, tuple[float, ...]]
+    others: list[Minimum]
+    starts: int
+    warnings: list[str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings, lists and dictionaries."""
+        return {
+            "format": "dea-rig homogeneous tests 1",
+            "convention": CONVENTION,
+            "quantities": {name: quantity_dict(quantity) for name, quantity in self.quantities.items()},
+            "r_squared": self.r_squared,
+            "prediction_r_squared": self.prediction,
+            "residuals_Pa": {name: list(values) for name, values in self.residuals.items()},
+            "equally_good": [
+                {"mu_Pa": list(other.mu), "alpha": list(other.alpha), "cost": other.cost} for other in self.others
+            ],
+            "starts": self.starts,
+            "warnings": self.warnings,
+        }
+
+    def to_json(self) -> str:
+        """`to_dict` as JSON text."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
+
+
+def load_test(path: Path) -> HomogeneousTest:
+    """Read one CSV file; see the module's docstring for its form. Raises `TestsError`."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(LARGEST_BYTES + 1)
+    except OSError as error:
+        raise TestsError(f"{path}: cannot read the test: {error.strerror}") from error
+    if len(raw) > LARGEST_BYTES:
+        raise TestsError(f"{path}: larger than {LARGEST_BYTES // 1024**2} MB; this is no stress-stretch table")
+    try:
+        lines = raw.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise TestsError(f"{path}: not a text file (byte {error.start})") from error
+    kind = _kind(path, [line for line in lines if line.startswith("#")])
+    table = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
+    if len(table) < 3:
+        raise TestsError(f"{path}: a heading and at least two rows are needed, there are {len(table)} rows")
+    for line, row in enumerate(table[1:], start=1):
+        if len(row) != len(table[0]):
+            raise TestsError(
+                f"{path}: row {line} below the heading has {len(row)} values and the heading {len(table[0])}; values "
+                "are separated by commas, and decimals have a point"
+            )
+    columns = _columns(path, [cell.strip() for cell in table[0]], table[1:])
+    if kind == "biaxial":
+        stretch1, stretch2 = columns["stretch1"], columns["stretch2"]
+        stress1, stress2 = columns["nominal_stress1"], columns["nominal_stress2"]
+    else:
+        stretch1, stress1 = columns["stretch"], columns["nominal_stress"]
+        stretch2 = {"uniaxial": stretch1**-0.5, "equibiaxial": stretch1, "pure shear": np.ones_like(stretch1)}[kind]
+        stress2 = np.full_like(stress1, np.nan)
+    return HomogeneousTest(path.stem, kind, stretch1, stretch2, stress1, stress2)
+
+
+def _kind(path: Path, remarks: Sequence[str]) -> str:
+    for remark in remarks:
+        key, _, value = remark.lstrip("# ").partition(":")
+        if key.strip() == "kind":
+            if value.strip() in KINDS:
+                return value.strip()
+            raise TestsError(f"{path}: kind is {value.strip()!r}; allowed are {', '.join(KINDS)}")
+    name = path.stem.lower().replace("_", " ").replace("-", " ")
+    for kind in KINDS:
+        if kind in name:
+            return kind
+    raise TestsError(
+        f"{path}: what kind of test is it? Write '# kind: KIND' the heading, with one of {', '.join(KINDS)}"
+    )
+
+
+def _columns(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Array]:
+    """Columns by name without unit, in SI units."""
+    columns: dict[str, Array] = {}
+    for number, title in enumerate(heading):
+        base, factor = title, 1.0
+        if title.startswith("nominal_stress"):
+            base, _, unit = title.rpartition("_")
+            if unit not in UNITS:
+                raise TestsError(f"{path}: column {title!r} has no unit; allowed are {', '.join(UNITS)}")
+            factor = UNITS[unit]
+        try:
+            column = np.array([float(row[number]) for row in rows])
+        except (ValueError, IndexError) as error:
+            raise TestsError(f"{path}: column {title!r} holds something that is not a number: {error}") from error
+        if not np.isfinite(column).all():
+            raise TestsError(
+                f"{path}: column {title!r} holds a value that is not finite, in row "
+                f"{int(np.flatnonzero(~np.isfinite(column))[0]) + 1} below the heading"
+            )
+        if title.startswith("stretch") and not (column > 0.0).all():
+            raise TestsError(
+                f"{path}: column {title!r} holds a stretch that is not positive; 1 is the unstretched sheet"
+            )
+        columns[base] = column * factor
+    single, double = {"stretch", "nominal_stress"}, {"stretch1", "stretch2", "nominal_stress1", "nominal_stress2"}
+    if set(columns) not in (single, double):
+        raise TestsError(
+            f"{path}: the columns are {', '.join(heading)}; wanted are stretch, nominal_stress_MPa, or for biaxial "
+            "tests stretch1, stretch2, nominal_stress1_MPa, nominal_stress2_MPa, separated by commas"
+        )
+    return columns
+
+
+def nominal_stress(mu: Sequence[float], alpha: Sequence[float], test: HomogeneousTest) -> Array:
+    """The model's stresses (Pa), in the order of ``test.measured``."""
+    return _stress(np.array(mu), np.array(alpha), test)[0]
+
+
+def _stress(mu: Array, alpha: Array, test: HomogeneousTest) -> tuple[Array, Array, Array]:
+    """Stresses, and their derivatives by mu and by alpha; shapes (k,), (k, N), (k, N)."""
+    along = np.concatenate((test.stretch1, test.stretch2))[:, None]
+    product = np.tile(test.stretch1 * test.stretch2, 2)[:, None]
+    rows = np.isfinite(np.concatenate((test.stress1, test.stress2)))
+    along, product = along[rows], product[rows]
+    by_mu = (along**alpha - product**-alpha) / along
+    by_alpha = mu * (along**alpha * np.log(along) + product**-alpha * np.log(product)) / along
+    return by_mu @ mu, by_mu, by_alpha
+
+
+def r_squared(mu: Sequence[float], alpha: Sequence[float], test: HomogeneousTest) -> float:
+    """Share of the variance of the measured stresses that the model explains; negative if a constant does better."""
+    measured = test.measured
+    residual = measured - nominal_stress(mu, alpha, test)
+    return float(1.0 - residual @ residual / ((measured - measured.mean()) @ (measured - measured.mean())))
+
+
+def fit_tests(
+    tests: Sequence[HomogeneousTest],
+    *,
+    terms: int = 3,
+    starts: int = 24,
+    seed: int = 0,
+    weighting: Weighting = "balanced",
+    predict: Sequence[HomogeneousTest] = (),
+) -> TestsFit:
+    """Fit Ogden terms to one or several tests at once.
+
+    Parameters
+    ----------
+    weighting : {"balanced", "relative"}
+        "balanced" makes every test count alike, whatever its stresses and its number of points: it minimises the sum of
+        ``1 - R^2``. "relative" counts relative errors, so that small stretches matter as much as large ones; stresses
+        below a hundredth of the largest are weighted like that.
+    predict : sequence of HomogeneousTest
+        Tests that take no part in the fit and are held against it: a fit to one mode can fail badly in another.
+
+    Raises
+    ------
+    TestsError
+        When there are fewer data than parameters, or no fit converges.
+    """
+    if not tests:
+        raise TestsError("there are no tests to fit")
+    problem = _TestsProblem(tests, terms, weighting)
+    if problem.measured.size <= 2 * terms:
+        raise TestsError(f"{problem.measured.size} stresses cannot determine {2 * terms} parameters")
+    found = sorted((problem.minimise(x) for x in problem.starting_points(starts, seed)), key=lambda pair: pair[1].cost)
+    x, best = found[0]
+    equal = best.cost * (1.0 + SAME_MINIMUM / (problem.measured.size - 2 * terms))
+    others = _distinct([minimum for _, minimum in found if minimum.cost <= equal])[1:]
+    fit = TestsFit(
+        mu=best.mu,
+        alpha=best.alpha,
+        quantities=problem.quantities(x, best),
+        r_squared={test.name: r_squared(best.mu, best.alpha, test) for test in tests},
+        prediction={test.name: r_squared(best.mu, best.alpha, test) for test in predict},
+        residuals={
+            test.name: tuple(float(v) for v in test.measured - nominal_stress(best.mu, best.alpha, test))
+            for test in tests
+        },
+        others=others,
+        starts=starts,
+        warnings=[],
+    )
+    fit.warnings.extend(_warnings(fit, tests, predict))
+    return fit
+
+
+def cross_prediction(tests: Sequence[HomogeneousTest], **options: Any) -> dict[str, TestsFit]:
+    """A fit to each test alone, held against all the others; ``options`` as in `fit_tests`."""
+    return {
+        test.name: fit_tests([test], predict=[other for other in tests if other is not test], **options)
+        for test in tests
+    }
+
+
+class _TestsProblem:
+    """Weighted residuals over ``x = [g_1..g_N, alpha_1..alpha_N]`` with ``g_n = mu_n alpha_n / (2 G_0)``."""
+
+    def __init__(self, tests: Sequence[HomogeneousTest], terms: int, weighting: Weighting) -> None:
+        self.tests = tests
+        self.terms = terms
+        self.measured = np.concatenate([test.measured for test in tests])
+        size = np.abs(self.measured)
+        for test in tests:
+            if not np.ptp(test.measured) > 0.0:
+                raise TestsError(
+                    f"{test.name}: all stresses are {test.measured[0]:g} Pa; nothing can be fitted to that"
+                )
+        if weighting == "relative":
+            self.weight = 1.0 / np.maximum(size, 0.01 * size.max())
+        else:
+            spread = [float(np.linalg.norm(test.measured - test.measured.mean())) for test in tests]
+            self.weight = np.repeat(1.0 / np.array(spread), [test.measured.size for test in tests])
+        # The neo-Hookean modulus that fits best sets the scale.
+        unit, *_ = self._model(np.array([1.0]), np.array([2.0]))
+        scale = float((self.weight**2 * self.measured) @ unit / ((self.weight**2 * unit) @ unit))
+        if not scale > 0.0:
+            names = ", ".join(test.name for test in tests)
+            raise TestsError(f"{names}: the stresses do not rise with the stretch; tension has to be positive")
+        self.scale = scale
+
+    def _model(self, mu: Array, alpha: Array) -> tuple[Array, Array, Array]:
+        parts = [_stress(mu, alpha, test) for test in self.tests]
+        stress, by_mu, by_alpha = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        return stress, by_mu, by_alpha
+
+    def residual(self, x: Array) -> Array:
+        mu, alpha = self.film(x)
+        residual: Array = (self._model(mu, alpha)[0] - self.measured) * self.weight
+        return residual
+
+    def jacobian(self, x: Array) -> Array:
+        mu, alpha = self.film(x)
+        _, by_mu, by_alpha = self._model(mu, alpha)
+        columns: Array = np.concatenate((by_mu * 2.0 * self.scale / alpha, by_alpha - by_mu * mu / alpha), axis=1)
+        columns *= self.weight[:, None]
+        return columns
+
+    def film(self, x: Array) -> tuple[Array, Array]:
+        share, alpha = x[: self.terms], x[self.terms :]
+        mu: Array = 2.0 * self.scale * share / alpha
+        return mu, alpha
+
+    def starting_points(self, count: int, seed: int) -> list[Array]:
+        """Random exponents; in every other set of two terms or more one of them is negative, as in Ogden's own."""
+        random = np.random.default_rng(seed)
+        points = []
+        for number in range(count):
+            alpha = np.sort(np.exp(random.uniform(math.log(0.8), math.log(9.0), self.terms)))
+            if self.terms > 1 and number % 2 == 0:
+                alpha[random.integers(self.terms)] *= -1.0
+            points.append(np.concatenate((random.dirichlet(np.ones(self.terms)), alpha)))
+        return points
+
+    def minimise(self, start: Array) -> tuple[Array, Minimum]:
+        import lmfit
+
+        parameters = lmfit.Parameters()
+        names = [f"g{n + 1}" for n in range(self.terms)] + [f"alpha{n + 1}" for n in range(self.terms)]
+        for k, (name, value) in enumerate(zip(names, start, strict=True)):
+            low, high = SHARE_BOUNDS if k < self.terms else EXPONENT_BOUNDS
+            if value < 0.0:
+                low, high = -high, -low
+            parameters.add(name, value=float(np.clip(value, low + 1e-6, high - 1e-6)), min=low, max=high)
+
+        def vector(values: Mapping[str, Any]) -> Array:
+            return np.array([values[name].value for name in names])
+
+        with python_warnings.catch_warnings(), np.errstate(all="ignore"):
+            # lmfit takes square roots of a covariance that need not be positive definite; ours is used instead.
+            python_warnings.simplefilter("ignore")
+            out = lmfit.Minimizer(lambda p: self.residual(vector(p)), parameters, nan_policy="raise").minimize(
+                method="least_squares", jac=lambda p: self.jacobian(vector(p)), x_scale="jac", max_nfev=400
+            )
+        x = vector(out.params)
+        order = np.argsort(x[self.terms :])
+        x = np.concatenate((x[: self.terms][order], x[self.terms :][order]))
+        mu, alpha = self.film(x)
+        residual = self.residual(x)
+        return x, Minimum(tuple(map(float, mu)), tuple(map(float, alpha)), float(residual @ residual))
+
+    def quantities(self, x: Array, best: Minimum) -> dict[str, Quantity]:
+        """Values with standard uncertainties from the scatter about the fit."""
+        n = self.terms
+        mu, alpha = self.film(x)
+        jacobian = self.jacobian(x)
+        scatter = best.cost / (self.measured.size - 2 * n)
+        norms = np.linalg.norm(jacobian, axis=0)
+        norms[norms == 0.0] = 1e-30
+        _, s, vt = np.linalg.svd(jacobian / norms, full_matrices=False)
+        half = vt.T / np.maximum(s, 1e-13 * s[0]) / norms[:, None]
+        share, exponent = np.abs(x[:n]), np.abs(x[n:])
+        vanished = (share < 100 * SHARE_BOUNDS[0]) | (share > 0.999 * SHARE_BOUNDS[1])
+        at_edge = (exponent < 1.01 * EXPONENT_BOUNDS[0]) | (exponent > 0.999 * EXPONENT_BOUNDS[1])
+        rows: dict[str, tuple[float, Array, str, bool]] = {}
+        for k in range(n):
+            by_share, by_alpha = np.zeros(2 * n), np.zeros(2 * n)
+            by_share[k], by_share[n + k] = 2.0 * self.scale / alpha[k], -mu[k] / alpha[k]
+            by_alpha[n + k] = 1.0
+            rows[f"mu{k + 1}"] = (mu[k], by_share, "Pa", bool(vanished[k]))
+            rows[f"alpha{k + 1}"] = (alpha[k], by_alpha, "1", bool(vanished[k] or at_edge[k]))
+        rows["G"] = (0.5 * float(mu @ alpha), np.repeat([self.scale, 0.0], n), "Pa", False)
+        quantities = {}
+        for name, (value, gradient, unit, edge) in rows.items():
+            uncertainty = math.sqrt(scatter) * float(np.linalg.norm(gradient @ half))
+            words = verdict(uncertainty / abs(value), edge)
+            quantities[name] = Quantity(float(value), uncertainty, unit, {"scatter": uncertainty}, words, edge)
+        return quantities
+
+
+def _distinct(minima: Sequence[Minimum]) -> list[Minimum]:
+    """Those that differ from all before them by more than 5 % in some parameter."""
+    kept: list[Minimum] = []
+    for minimum in minima:
+        here = np.array(minimum.mu + minimum.alpha)
+        if all((np.abs(np.array(k.mu + k.alpha) - here) > 0.05 * np.abs(here)).any() for k in kept):
+            kept.append(minimum)
+    return kept
+
+
+def _warnings(fit: TestsFit, tests: Sequence[HomogeneousTest], predict: Sequence[HomogeneousTest]) -> list[str]:
+    words = []
+    if fit.others:
+        words.append(
+            f"{len(fit.others)} other sets of parameters fit as well within the scatter, for instance alpha = "
+            + ", ".join(f"{value:.3g}" for value in fit.others[0].alpha)
+        )
+    lost = [name for name, quantity in fit.quantities.items() if quantity.verdict.startswith("not")]
+    if lost:
+        words.append(f"not determined by these tests: {', '.join(lost)}")
+    for test in predict:
+        if fit.prediction[test.name] < 0.9:
+            words.append(
+                f"{test.name} ({test.kind}) is not predicted: R^2 = {fit.prediction[test.name]:.3g}; "
+                "do not use these parameters for that mode"
+            )
+    if len({test.kind for test in tests}) == 1 and tests[0].kind != "biaxial":
+        words.append(f"only {tests[0].kind} data were fitted: the film in a cone is stretched in two directions")
+    return words

@@ -1,0 +1,563 @@
+"""Strain-gauge amplifiers GSV-8 and GSV-6 of ME-Messsysteme: binary protocol over USB-CDC or UART.
+
+Frames, big-endian, all beginning with AA and ending with 85 (n = number of data bytes, k = channels - 1)::
+
+    request   AA 9n CC p1..pn 85      CC command
+    answer    AA 5n EE d1..dn 85      EE error code: 00 done, 01 done and other settings changed, 40.. refused
+    measured  AA 1k SS v1..           SS status: bit 7 set, bits 6..4 type (1 int16, 2 int24, 3 float32),
+                                      bit 1 six-axis error, bit 0 input overload
+
+After power-up the amplifier streams by itself. An integer is the bridge signal as a fraction of full scale, in
+binary-offset coding; a float is the signal in input ranges, times the user scale, plus the user offset. Sources:
+gsv86lib 0.1.1 and MEGSV86x64.h, both by the manufacturer.
+
+What this protocol cannot show
+    There is no checksum, no counter, no time stamp, and an answer does not say which request it answers. A changed bit
+    *inside* a value is a wrong value that looks like any other. What is enforced: the prefix, the header of measured
+    frames (channels and type, once known), the frame's length, the closing 85, known error codes, the data length that
+    each answer must have, and that a value is finite and within twice the input range. One to three bytes lost from a
+    frame are always noticed by the closing 85; more are missed once in about 256 times. Lost frames are noticed by rate
+    (`drivers.sample_clock`). After a request had to be repeated, the line must stay quiet for one timeout before
+    the next, so that a late answer is not given to another request.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import deque
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.dialogue import LOST_AGAIN_S, Ask, Dialogue, label
+from drivers.dialogue import Answer as Answered
+from drivers.links.link import ByteLink, DeviceRefused
+from drivers.roles import ForceSample, Identity, SampleFlag
+from drivers.stream import Stream
+
+FrameType = Literal["int16", "int24", "float32"]
+
+PREFIX = 0xAA
+SUFFIX = 0x85
+MAX_FRAME = 68  # a measured frame of 16 float channels
+
+_TYPES: dict[int, FrameType] = {1: "int16", 2: "int24", 3: "float32"}
+_WIDTH: dict[FrameType, int] = {"int16": 2, "int24": 3, "float32": 4}
+
+STOP_TRANSMISSION = 0x23
+START_TRANSMISSION = 0x24
+GET_VALUE = 0x3B
+SET_ZERO = 0x0C
+READ_USER_SCALE = 0x14
+READ_USER_OFFSET = 0x9A
+GET_SERIAL_NUMBER = 0x1F
+GET_FIRMWARE_VERSION = 0x2B
+SET_TX_MODE = 0x81
+READ_DATA_RATE = 0x8A
+WRITE_DATA_RATE = 0x8B
+GET_INPUT_TYPE = 0xA2
+
+COMMANDS = {
+    STOP_TRANSMISSION: "StopTransmission",
+    START_TRANSMISSION: "StartTransmission",
+    GET_VALUE: "GetValue",
+    SET_ZERO: "SetZero",
+    READ_USER_SCALE: "ReadUserScale",
+    READ_USER_OFFSET: "ReadUserOffset",
+    GET_SERIAL_NUMBER: "GetSerialNo",
+    GET_FIRMWARE_VERSION: "GetFirmwareVersion",
+    SET_TX_MODE: "SetTXMode",
+    READ_DATA_RATE: "ReadDataRate",
+    WRITE_DATA_RATE: "WriteDataRate",
+    GET_INPUT_TYPE: "GetInputType",
+}
+
+ERRORS = {
+    0x00: "done",
+    0x01: "done, and other settings changed with it",
+    0x40: "command unknown",
+    0x41: "command not implemented in this model",
+    0x42: "request frame malformed",
+    0x50: "wrong parameter",
+    0x51: "wrong index or address",
+    0x52: "wrong data in a parameter",
+    0x53: "wrong bits in a parameter",
+    0x54: "parameter too big",
+    0x55: "parameter too small",
+    0x56: "combination of parameters not allowed",
+    0x57: "parameter too big in relation to the others",
+    0x58: "parameter too small in relation to the others",
+    0x59: "parameter not supported",
+    0x5A: "parameters did not arrive within 200 ms",
+    0x5B: "wrong number of parameters",
+    0x5C: "parameter does not fit the present settings",
+    0x5E: "memory in the wrong condition",
+    0x5F: "memory access denied",
+    0x70: "access denied",
+    0x71: "writing is blocked",
+    0x72: "password missing or wrong",
+    0x74: "written too many times",
+    0x75: "no permission to write on this port",
+    0x80: "internal error",
+    0x81: "arithmetic error",
+    0x82: "analogue-digital converter failed",
+    0x83: "measured value in error",
+    0x84: "EEPROM failed",
+    0x91: "transmit buffer overflow",
+    0x92: "busy",
+    0x99: "receive buffer full",
+}
+
+INPUT_TYPES = {
+    0: "bridge at 8.75 V",
+    1: "bridge at 5 V",
+    2: "bridge at 2.5 V",
+    3: "single ended",
+    4: "Pt1000",
+    5: "thermocouple K",
+}
+
+# SetTXMode, index 1. float32 is what the manufacturer's Python library sends; the integer codes follow the
+# manufacturer's header and are unproven on hardware. The type of the frames that follow is the proof.
+_TX_MODE: dict[FrameType, int] = {"int16": 0x0001, "int24": 0x0002, "float32": 0x0010}
+
+_QUIET_S = 0.05  # frames still on their way after the stream was stopped
+_UNKNOWN_RANGE_LIMIT = 100.0  # mV/V
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """Answer frame: error code and data."""
+
+    error: int
+    data: bytes
+
+    @property
+    def meaning(self) -> str:
+        return f"{ERRORS[self.error]} (error {self.error:02X})"
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Measured frame. Integers are given as sent, in binary-offset coding."""
+
+    type: FrameType
+    values: tuple[float, ...]
+    overload: bool
+    six_axis_error: bool
+
+
+Message = Reply | Measured
+
+
+def encode(command: int, parameters: bytes = b"") -> bytes:
+    """Request frame; ``parameters`` of at most 15 bytes."""
+    if len(parameters) > 15:
+        raise ValueError(f"{len(parameters)} parameter bytes; a GSV-8 request holds at most 15")
+    return bytes((PREFIX, 0x90 | len(parameters), command)) + parameters + bytes((SUFFIX,))
+
+
+class Decoder:
+    """Bytes to frames. Never raises; holds back less than one frame.
+
+    ``expect`` narrows measured frames to one type and number of channels: what does not match is then dropped byte by
+    byte like any other garbage. Counters: ``dropped_bytes`` and ``bad_frames`` (a plausible header whose frame did not
+    close with 85).
+    """
+
+    def __init__(self, counters: dict[str, int] | None = None) -> None:
+        self.counters = {} if counters is None else counters
+        self.counters.setdefault("dropped_bytes", 0)
+        self.counters.setdefault("bad_frames", 0)
+        self._buffer = b""
+        self._expected: tuple[FrameType, int] | None = None
+
+    def expect(self, frame_type: FrameType, channels: int) -> None:
+        """Accept measured frames of this shape only."""
+        self._expected = (frame_type, channels)
+
+    def expect_any(self) -> None:
+        """Accept measured frames of every shape."""
+        self._expected = None
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Frames completed by ``data``, in order."""
+        buffer = self._buffer + data
+        messages: list[Message] = []
+        at = 0
+        while True:
+            start = buffer.find(PREFIX, at)
+            if start < 0:
+                start = len(buffer)
+            self.counters["dropped_bytes"] += start - at
+            at = start
+            length = self._length(buffer, at)
+            if length is None:
+                break
+            if length == 0 or buffer[at + length - 1] != SUFFIX:
+                self.counters["bad_frames"] += length != 0
+                self.counters["dropped_bytes"] += 1
+                at += 1
+                continue
+            messages.append(self._parse(buffer, at, length))
+            at += length
+        self._buffer = buffer[at:]
+        return messages
+
+    def _length(self, buffer: bytes, at: int) -> int | None:
+        """Length of the frame at ``at``; 0 when there cannot be one, None while bytes are missing to know."""
+        left = len(buffer) - at
+        if left < 2:
+            return None
+        kind, low = buffer[at + 1] & 0xF0, buffer[at + 1] & 0x0F
+        if kind not in (0x10, 0x50):
+            return 0
+        if left < 3:
+            return None
+        third = buffer[at + 2]
+        if kind == 0x50:
+            length = 4 + low if third in ERRORS else 0
+        else:
+            frame_type = _TYPES.get((third >> 4) & 7)
+            if not third & 0x80 or frame_type is None or self._expected not in (None, (frame_type, low + 1)):
+                return 0
+            length = 4 + (low + 1) * _WIDTH[frame_type]
+        return length if left >= length else None
+
+    @staticmethod
+    def _parse(buffer: bytes, at: int, length: int) -> Message:
+        status = buffer[at + 2]
+        payload = buffer[at + 3 : at + length - 1]
+        if buffer[at + 1] & 0xF0 == 0x50:
+            return Reply(status, payload)
+        frame_type = _TYPES[(status >> 4) & 7]
+        values: tuple[float, ...]
+        if frame_type == "float32":
+            values = struct.unpack(f">{len(payload) // 4}f", payload)
+        elif frame_type == "int16":
+            values = struct.unpack(f">{len(payload) // 2}H", payload)
+        else:
+            values = tuple(int.from_bytes(payload[i : i + 3], "big") for i in range(0, len(payload), 3))
+        return Measured(frame_type, values, bool(status & 1), bool(status & 2))
+
+
+def identity(serial: bytes, firmware: bytes) -> Identity:
+    """From the data of GetSerialNo and GetFirmwareVersion; empty bytes where the amplifier did not say."""
+    pair = f"{int.from_bytes(firmware[:2], 'big')}.{int.from_bytes(firmware[2:], 'big')}"
+    return Identity(
+        model="GSV-8",
+        serial=str(int.from_bytes(serial, "big")) if serial else "",
+        firmware=pair if len(firmware) == 4 else firmware.hex(),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    command: int
+    parameters: bytes = b""
+    answer_lengths: tuple[int, ...] = (0,)  # data bytes that a good answer may have; empty: any
+
+    def __str__(self) -> str:
+        return COMMANDS[self.command]
+
+
+_Step = Ask[_Request]
+_Got = Answered[Message]
+
+
+class GSV8:
+    """A force sensor on one channel of a GSV-8 or GSV-6, streaming.
+
+    The set-up dialogue stops the stream, reads serial number, firmware, input range and user scale, sets frame type
+    and data rate, reads both back (the frame type from a frame), and starts the stream.
+
+    The reading is the bridge signal in mV/V. For floats it is ``(value - user offset) / user scale``, times the input
+    range: the manufacturer's header calls a float the product of user scale and raw value, and his helper sets the
+    scale to capacity / sensitivity * input range. Where a device should prove that its user scale multiplies the
+    signal in mV/V itself, ``user_scale_of = "mV/V"`` leaves the input range out. For integers it is the value times
+    the input range. Check the scale once with a known weight or a bridge simulator.
+
+    A value that is not finite or lies beyond twice the input range, in a frame that does not report an overload, is
+    dropped and counted (``bad_values``) and leaves its place in time empty. A frame that reports an overload is flagged
+    ``OVER_RANGE``; its reading is NaN with ``NO_VALUE`` if it is not finite.
+
+    Parameters
+    ----------
+    channel : int
+        1 to 16, as counted by the amplifier.
+    rate_Hz : float
+        Data rate to be set. A rate that reads back more than 1 % off is refused.
+    frame_type : {"float32", "int24", "int16"}
+        What the amplifier shall send.
+    timeout_s : float
+        How long to wait for each answer, and for the next measured frame before the sensor is called silent (or
+        five sample periods, if that is longer).
+    poll_interval_s : float
+        Longest time between two polls. They are spaced unevenly on purpose: polls in step with the stream would
+        hide when samples really arrive.
+    input_range_mV_per_V : float, optional
+        Overrides the input range read from the amplifier.
+    int_full_scale : float
+        Signal at the largest integer, in input ranges.
+    """
+
+    reading_unit = "mV/V"
+
+    def __init__(
+        self,
+        name: str,
+        link: ByteLink,
+        *,
+        channel: int = 1,
+        rate_Hz: float = 100.0,
+        frame_type: FrameType = "float32",
+        timeout_s: float = 0.25,
+        poll_interval_s: float = 0.01,
+        user_scale_of: Literal["range", "mV/V"] = "range",
+        input_range_mV_per_V: float | None = None,
+        int_full_scale: float = 1.05,
+    ) -> None:
+        where = label(name, link)
+        if not 1 <= channel <= 16:
+            raise DeviceRefused(where, f"channel {channel} does not exist", "A GSV-8 counts 1 to 8, a GSV-6 1 to 6.")
+        if not 0 < rate_Hz <= 48000:
+            raise DeviceRefused(where, f"data rate {rate_Hz} Hz is not possible", "Allowed: above 0, at most 48000 Hz.")
+        if input_range_mV_per_V is not None and not 0 < input_range_mV_per_V <= 1000:
+            raise DeviceRefused(where, f"input range {input_range_mV_per_V} mV/V is not possible", "Typical: 2 or 3.5.")
+        self.name = name
+        self._label = where
+        self.identity = Identity(model="GSV-8")
+        self.settings: dict[str, str] = {}
+        self.counters: dict[str, int] = {"unexpected_answers": 0, "ignored_frames": 0, "bad_values": 0, "overloads": 0}
+        self._link = link
+        self._channel = channel
+        self._rate = rate_Hz
+        self._frame_type: FrameType = frame_type
+        self._timeout = timeout_s
+        self._interval = poll_interval_s
+        self._user_scale_of = user_scale_of
+        self._range = input_range_mV_per_V
+        self._int_full_scale = int_full_scale
+        self._decoder = Decoder(self.counters)
+        self._dialogue: Dialogue[_Request, Message] = Dialogue(
+            where,
+            self._transmit,
+            self.counters,
+            timeout_s=timeout_s,
+            advice="Check that the amplifier is switched on, its cable, and the baud rate.",
+        )
+        self._settle_s = 0.0
+        self._gain = math.nan
+        self._offset = 0.0
+        self._limit = _UNKNOWN_RANGE_LIMIT
+        self._stream: Stream | None = None
+        self._fresh = True
+        self._inbox: deque[Message] = deque()
+        self._next_poll = -math.inf
+
+    @property
+    def ready(self) -> bool:
+        return self._stream is not None
+
+    @property
+    def rate(self) -> float:
+        """Data rate in hertz: as asked for until it has been read back."""
+        return self._rate
+
+    @property
+    def next_poll(self) -> float:
+        return self._next_poll
+
+    @property
+    def busy(self) -> bool:
+        """True while a command waits to be sent or answered."""
+        return not self._dialogue.idle
+
+    def set_zero(self) -> None:
+        """Make the present signal of this channel the amplifier's zero. All later readings refer to it."""
+        self._dialogue.begin(self._zero())
+        self._next_poll = -math.inf
+
+    def close(self) -> None:
+        self._link.close()
+
+    def poll(self, now: float) -> Sequence[ForceSample]:
+        self._next_poll = now + LOST_AGAIN_S
+        data = self._link.read()
+        if self._fresh:
+            data = b""  # whatever was in the line belongs to an earlier conversation
+        self._fresh = False
+        if self._stream is None and self._dialogue.idle:
+            self._decoder.expect_any()
+            self._dialogue.begin(self._set_up())
+        arrived: list[ForceSample | None] = []
+        self._inbox.extend(self._decoder.feed(data))
+        while self._inbox:  # an error that an answer brings on leaves the others for the next poll
+            message = self._inbox.popleft()
+            if isinstance(message, Measured) and self._stream is not None:
+                arrived.append(self._sample(message))
+            elif not self._dialogue.offer(message, now):
+                self.counters["ignored_frames" if isinstance(message, Measured) else "unexpected_answers"] += 1
+        self._dialogue.run(now)
+        stream = self._stream
+        look = now + self._interval if stream is None else stream.next_poll(now)
+        self._next_poll = min(look, self._dialogue.next_poll(now))
+        return [] if stream is None else stream.take(now, arrived)
+
+    # -- stream -----------------------------------------------------------------------------------------------------
+
+    def _sample(self, frame: Measured) -> ForceSample | None:
+        reading = (frame.values[self._channel - 1] - self._offset) * self._gain
+        flags = SampleFlag(0)
+        if frame.six_axis_error:
+            flags |= SampleFlag.SENSOR_ERROR
+        if frame.overload:
+            self.counters["overloads"] += 1
+            flags |= SampleFlag.OVER_RANGE
+            if not math.isfinite(reading):
+                reading, flags = math.nan, flags | SampleFlag.NO_VALUE
+        elif not abs(reading) <= self._limit:
+            self.counters["bad_values"] += 1
+            return None
+        return ForceSample(math.nan, reading, flags)
+
+    # -- dialogue ---------------------------------------------------------------------------------------------------
+
+    def _transmit(self, request: _Request) -> _Recogniser:
+        self._link.write(encode(request.command, request.parameters))
+        return _Recogniser(request)
+
+    def _ask(
+        self, command: int, parameters: bytes = b"", lengths: tuple[int, ...] = (0,), delay_s: float = 0
+    ) -> Generator[_Step, _Got, Reply]:
+        """One request; refused answers are returned like others."""
+        message = yield from self._exchange(_Request(command, parameters, lengths), delay_s)
+        assert isinstance(message, Reply)
+        return message
+
+    def _exchange(self, request: _Request, delay_s: float = 0) -> Generator[_Step, _Got, Message]:
+        delay_s, self._settle_s = max(delay_s, self._settle_s), self._timeout  # in case this one goes wrong
+        retries = self.counters["retries"]
+        answer = yield Ask(request, delay_s=delay_s)
+        if self.counters["retries"] == retries:
+            self._settle_s = 0.0
+        return answer.message
+
+    def _demand(
+        self, command: int, parameters: bytes = b"", lengths: tuple[int, ...] = (0,), delay_s: float = 0
+    ) -> Generator[_Step, _Got, bytes]:
+        """One request whose refusal ends the dialogue."""
+        reply = yield from self._ask(command, parameters, lengths, delay_s)
+        if reply.error > 0x01:
+            raise DeviceRefused(
+                self._label,
+                f"{COMMANDS[command]} refused: {reply.meaning}",
+                "Check channel, rate and frame type against the amplifier, and that its settings are not locked.",
+            )
+        return reply.data
+
+    def _set_up(self) -> Generator[_Step, _Got, None]:
+        channel = bytes((self._channel,))
+        yield from self._demand(STOP_TRANSMISSION)
+        serial = yield from self._ask(GET_SERIAL_NUMBER, lengths=(4,), delay_s=_QUIET_S)
+        firmware = yield from self._ask(GET_FIRMWARE_VERSION, lengths=())
+        self.identity = identity(
+            serial.data if serial.error <= 1 else b"", firmware.data if firmware.error <= 1 else b""
+        )
+        yield from self._read_scaling(channel)
+        yield from self._demand(SET_TX_MODE, struct.pack(">BH", 1, _TX_MODE[self._frame_type]))
+        yield from self._demand(WRITE_DATA_RATE, struct.pack(">f", self._rate))
+        data = yield from self._demand(READ_DATA_RATE, lengths=(4,))
+        (rate,) = struct.unpack(">f", data)
+        if not abs(rate - self._rate) <= 0.01 * self._rate:
+            raise DeviceRefused(
+                self._label,
+                f"data rate reads back as {rate:.6g} Hz after {self._rate:.6g} Hz was written",
+                "Choose a rate that the amplifier supports.",
+            )
+        self._rate = rate
+        self.settings["data_rate_Hz"] = f"{rate:.9g}"
+        yield from self._check_frame()
+        yield from self._demand(START_TRANSMISSION)
+        self._stream = Stream(self._label, self._rate, self._timeout, self._interval, self.counters)
+
+    def _read_scaling(self, channel: bytes) -> Generator[_Step, _Got, None]:
+        reply = yield from self._ask(GET_INPUT_TYPE, channel + b"\xff", lengths=(5,))
+        if reply.error <= 1:
+            kind, hundredths = struct.unpack(">BI", reply.data)
+            self.settings["input_type"] = INPUT_TYPES.get(kind, f"type {kind}")
+            self.settings["input_range_mV_per_V"] = f"{hundredths / 100:g}"
+            if self._range is None and hundredths > 0:
+                self._range = hundredths / 100
+        needed = self._frame_type != "float32" or self._user_scale_of == "range"
+        if self._range is None and needed:
+            raise DeviceRefused(
+                self._label,
+                f"input range unknown: GetInputType answered {reply.meaning}",
+                "State input_range_mV_per_V in the scene.",
+            )
+        scale = yield from self._read_float(READ_USER_SCALE, channel, "user_scale")
+        offset = yield from self._read_float(READ_USER_OFFSET, channel, "user_offset")
+        if self._frame_type == "float32":
+            if not (math.isfinite(scale) and scale != 0 and math.isfinite(offset)):
+                raise DeviceRefused(
+                    self._label,
+                    f"user scale of channel {self._channel} is {scale:g}, its user offset {offset:g}",
+                    "Set them in the amplifier, to 1 and 0 say.",
+                )
+            self._gain = (self._range if self._user_scale_of == "range" and self._range else 1.0) / scale
+            self._offset = offset
+        else:
+            assert self._range is not None
+            self._offset = float(1 << (8 * _WIDTH[self._frame_type] - 1))
+            self._gain = self._range * self._int_full_scale / self._offset
+        self._limit = 2.0 * self._range if self._range is not None else _UNKNOWN_RANGE_LIMIT
+        self.settings["mV_per_V_per_unit"] = f"{self._gain:.9g}"
+
+    def _read_float(self, command: int, channel: bytes, key: str) -> Generator[_Step, _Got, float]:
+        data = yield from self._demand(command, channel, lengths=(4,))
+        value = float(struct.unpack(">f", data)[0])
+        self.settings[key] = f"{value:.9g}"
+        return value
+
+    def _check_frame(self) -> Generator[_Step, _Got, None]:
+        """One measured frame on request: it shows type and number of channels, and the stream is held to them."""
+        frame = yield from self._exchange(_Request(GET_VALUE))
+        if isinstance(frame, Reply):
+            raise DeviceRefused(self._label, f"GetValue refused: {frame.meaning}", "Check the sensor and its cable.")
+        if frame.type != self._frame_type:
+            raise DeviceRefused(
+                self._label,
+                f"sends {frame.type} although {self._frame_type} was set",
+                f'Set frame_type = "{frame.type}" in the scene, or change it in the amplifier.',
+            )
+        if self._channel > len(frame.values):
+            raise DeviceRefused(
+                self._label,
+                f"has {len(frame.values)} channels, but channel {self._channel} was asked for",
+                "Correct the channel in the scene.",
+            )
+        self._decoder.expect(frame.type, len(frame.values))
+        self.settings["frame_type"] = frame.type
+        self.settings["channels"] = str(len(frame.values))
+        self.settings["channel"] = str(self._channel)
+
+    def _zero(self) -> Generator[_Step, _Got, None]:
+        yield from self._demand(SET_ZERO, bytes((self._channel,)))
+
+
+class _Recogniser:
+    """Whether a message answers a request: by kind and length, since answers do not name their request."""
+
+    def __init__(self, request: _Request) -> None:
+        self._request = request
+
+    def __call__(self, message: Message) -> bool:
+        if isinstance(message, Measured):
+            return self._request.command == GET_VALUE
+        if message.error > 0x01:
+            return True
+        if self._request.command == GET_VALUE:
+            return False
+        return not self._request.answer_lengths or len(message.data) in self._request.answer_lengths

@@ -1,0 +1,845 @@
+"""HV supplies of iseg: EDCP (Enhanced Device Control Protocol) on classic CAN with 11-bit identifiers.
+
+Identifier ``0x200 | module << 3 | direction``: direction 1 is a read request, 0 is data. A host's write and a module's
+answer therefore look exactly alike; an answer is recognised only as the one that a pending read request asked for.
+Data begin with a 16-bit operation code, then for channel items the channel, then the value, big-endian::
+
+    201# 41 06 00              read nominal voltage of channel 0 of module 0
+    200# 41 06 00 45 BB 80 00  the module answers 6000 V
+    200# 41 00 00 44 BB 80 00  the host writes set-point 1500 V; there is no acknowledgement, so it is read back
+    201# D8 <status> <type>    an unregistered module announces itself;  200# D8 01 registers it
+
+A registered module stays quiet while it is addressed at least once a minute. That is no watchdog: nothing says that the
+output goes off when the host dies. Sources: isegcan 0.7.0 and drvAsynCan (operation codes), iseg manuals EHQ-1 (module
+bits), HPS (channel bits), EHQ 9005-F (log-on, kill).
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import NamedTuple, TypeVar
+
+from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, label
+from drivers.links.link import CanFrame, DeviceError, DeviceRefused, DeviceSilent, FrameLink
+from drivers.roles import HVFlag, HVSample, Identity
+
+T = TypeVar("T")
+
+
+class Item(NamedTuple):
+    """One entry of the module's object table: operation code, value format, whether it belongs to a channel."""
+
+    code: int
+    format: str
+    per_channel: bool
+    title: str
+
+
+def _module(code: int, form: str, title: str) -> Item:
+    return Item(code, form, False, title)
+
+
+def _channel(code: int, form: str, title: str) -> Item:
+    return Item(code, form, True, title)
+
+
+MODULE_STATUS = _module(0x1000, "H", "module status")
+MODULE_CONTROL = _module(0x1001, "H", "module control")
+MODULE_EVENTS = _module(0x1002, "H", "module event status")
+MODULE_RAMP = _module(0x1100, "f", "voltage ramp")
+TEMPERATURE = _module(0x1106, "f", "module temperature")
+SERIAL_NUMBER = _module(0x1200, "I", "serial number")
+FIRMWARE_RELEASE = _module(0x1201, "I", "firmware release")
+FIRMWARE_NAME = _module(0x1203, "4s", "firmware name")
+CHANNEL_COUNT = _module(0x1208, "B", "number of channels")
+CHANNEL_STATUS = _channel(0x4000, "H", "channel status")
+CHANNEL_CONTROL = _channel(0x4001, "H", "channel control")
+CHANNEL_EVENTS = _channel(0x4002, "H", "channel event status")
+TRIP_DELAY = _channel(0x4005, "H", "trip delay")
+TRIP_ACTION = _channel(0x4006, "B", "trip action")
+SET_VOLTAGE = _channel(0x4100, "f", "voltage set-point")
+SET_CURRENT = _channel(0x4101, "f", "current set-point")
+MEASURED_VOLTAGE = _channel(0x4102, "f", "measured voltage")
+MEASURED_CURRENT = _channel(0x4103, "f", "measured current")
+VOLTAGE_BOUNDS = _channel(0x4104, "f", "voltage bounds")
+CURRENT_BOUNDS = _channel(0x4105, "f", "current bounds")
+NOMINAL_VOLTAGE = _channel(0x4106, "f", "nominal voltage")
+NOMINAL_CURRENT = _channel(0x4107, "f", "nominal current")
+
+ITEMS = {
+    item.code: item
+    for item in (
+        MODULE_STATUS,
+        MODULE_CONTROL,
+        MODULE_EVENTS,
+        MODULE_RAMP,
+        TEMPERATURE,
+        SERIAL_NUMBER,
+        FIRMWARE_RELEASE,
+        FIRMWARE_NAME,
+        CHANNEL_COUNT,
+        CHANNEL_STATUS,
+        CHANNEL_CONTROL,
+        CHANNEL_EVENTS,
+        TRIP_DELAY,
+        TRIP_ACTION,
+        SET_VOLTAGE,
+        SET_CURRENT,
+        MEASURED_VOLTAGE,
+        MEASURED_CURRENT,
+        VOLTAGE_BOUNDS,
+        CURRENT_BOUNDS,
+        NOMINAL_VOLTAGE,
+        NOMINAL_CURRENT,
+    )
+}
+
+
+class ModuleStatus(IntFlag):
+    """Item 1000. The "good" bits are 1 when all is well."""
+
+    KILL_ENABLED = 1 << 15
+    TEMPERATURE_GOOD = 1 << 14
+    SUPPLY_GOOD = 1 << 13
+    MODULE_GOOD = 1 << 12
+    EVENT_ACTIVE = 1 << 11
+    SAFETY_LOOP_GOOD = 1 << 10
+    NO_RAMP = 1 << 9
+    NO_SUM_ERROR = 1 << 8
+    INPUT_ERROR = 1 << 6
+    HARDWARE_VOLTAGE_LIMIT_GOOD = 1 << 5
+    NEEDS_SERVICE = 1 << 4
+    HV_ON = 1 << 3
+    FINE_ADJUSTMENT = 1 << 0
+
+
+class ModuleControl(IntFlag):
+    """Item 1001."""
+
+    KILL = 1 << 14
+    ADJUSTMENT = 1 << 12
+    CLEAR = 1 << 6
+
+
+class ChannelStatus(IntFlag):
+    """Item 4000."""
+
+    VOLTAGE_LIMIT = 1 << 15
+    CURRENT_LIMIT = 1 << 14
+    TRIP = 1 << 13
+    EXTERNAL_INHIBIT = 1 << 12
+    VOLTAGE_BOUNDS = 1 << 11
+    CURRENT_BOUNDS = 1 << 10
+    ARC_ERROR = 1 << 9
+    LOW_RANGE = 1 << 8
+    CONSTANT_VOLTAGE = 1 << 7
+    CONSTANT_CURRENT = 1 << 6
+    EMERGENCY_OFF = 1 << 5
+    RAMPING = 1 << 4
+    ON = 1 << 3
+    INPUT_ERROR = 1 << 2
+    ARC = 1 << 1
+
+
+class ChannelEvents(IntFlag):
+    """Item 4002. Bits latch and are cleared by writing 1."""
+
+    VOLTAGE_LIMIT = 1 << 15
+    CURRENT_LIMIT = 1 << 14
+    TRIP = 1 << 13
+    EXTERNAL_INHIBIT = 1 << 12
+    VOLTAGE_BOUNDS = 1 << 11
+    CURRENT_BOUNDS = 1 << 10
+    CONSTANT_VOLTAGE = 1 << 7
+    CONSTANT_CURRENT = 1 << 6
+    EMERGENCY_OFF = 1 << 5
+    END_OF_RAMP = 1 << 4
+    ON_TO_OFF = 1 << 3
+    INPUT_ERROR = 1 << 2
+
+
+class ChannelControl(IntFlag):
+    """Item 4001."""
+
+    EMERGENCY_OFF = 1 << 5
+    ON = 1 << 3
+
+
+# Events that keep the channel from being switched on until they are cleared.
+BLOCKING = (
+    ChannelEvents.VOLTAGE_LIMIT
+    | ChannelEvents.CURRENT_LIMIT
+    | ChannelEvents.TRIP
+    | ChannelEvents.EXTERNAL_INHIBIT
+    | ChannelEvents.EMERGENCY_OFF
+)
+
+TRIP_ACTIONS = {
+    0: "flag only",
+    1: "off with ramp",
+    2: "off without ramp",
+    3: "whole module off",
+    4: "disabled",
+}
+
+# To all modules on the bus: emergency off of all channels. Needs no registration and gets no answer.
+EMERGENCY_OFF_ALL = CanFrame(0x004, bytes.fromhex("E80060010020"))
+
+Value = float | int | bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """A value: answer of the module, or some host's write."""
+
+    item: Item
+    channel: int | None
+    value: Value
+
+
+@dataclass(frozen=True, slots=True)
+class LogOn:
+    """An unregistered module announces itself, with its general status and type."""
+
+    status: int
+    type: int
+
+
+Message = Data | LogOn
+
+
+def _id(module: int, direction: int) -> int:
+    return 0x200 | module << 3 | direction
+
+
+def _head(item: Item, channel: int | None) -> bytes:
+    if item.per_channel != (channel is not None):
+        raise ValueError(f"{item.title} {'needs a' if item.per_channel else 'has no'} channel")
+    return struct.pack(">H", item.code) + (b"" if channel is None else bytes((channel,)))
+
+
+def read_request(module: int, item: Item, channel: int | None = None) -> CanFrame:
+    """Ask for the value of an item."""
+    return CanFrame(_id(module, 1), _head(item, channel))
+
+
+def read_many(module: int, item: Item, channels: Iterable[int]) -> CanFrame:
+    """Ask for the item of several channels (0 to 15); one single-channel answer comes for each."""
+    if not item.per_channel:
+        raise ValueError(f"{item.title} belongs to the module, not to a channel")
+    mask = sum(1 << c for c in set(channels))
+    return CanFrame(_id(module, 1), struct.pack(">HHB", item.code + 0x2000, mask, 0))
+
+
+def write(module: int, item: Item, value: Value, channel: int | None = None) -> CanFrame:
+    """Write an item. There is no acknowledgement."""
+    return CanFrame(_id(module, 0), _head(item, channel) + struct.pack(">" + item.format, value))
+
+
+def log_on(module: int) -> CanFrame:
+    """Register the module with this host."""
+    return CanFrame(_id(module, 0), b"\xd8\x01")
+
+
+def log_off(module: int) -> CanFrame:
+    """Release the module; it announces itself again."""
+    return CanFrame(_id(module, 0), b"\xd8\x00")
+
+
+def identity(serial: Value | None, release: Value | None, name: Value | None) -> Identity:
+    """From the items serial number, firmware release and firmware name; None where the module does not say."""
+    text = "".join(chr(b) for b in name if 0x20 < b < 0x7F) if isinstance(name, bytes) else ""
+    return Identity(
+        model=f"iseg {text}" if text else "iseg EDCP",
+        serial=f"{serial:d}" if isinstance(serial, int) else "",
+        firmware=".".join(str(b) for b in release.to_bytes(4, "big")) if isinstance(release, int) else "",
+    )
+
+
+class Decoder:
+    """Frames of one module to messages. Never raises.
+
+    Counters: ``foreign_frames`` (other identifiers), ``foreign_requests`` (read requests: another host on the bus,
+    or an interface that returns its own frames), ``bad_frames`` (unknown operation code or wrong length).
+    """
+
+    def __init__(self, module: int, counters: dict[str, int] | None = None) -> None:
+        self.counters = {} if counters is None else counters
+        for key in ("foreign_frames", "foreign_requests", "bad_frames"):
+            self.counters.setdefault(key, 0)
+        self._data_id = _id(module, 0)
+        self._request_id = _id(module, 1)
+
+    def feed(self, frame: CanFrame) -> Message | None:
+        """The frame's message; None (and counted) when it is not for us or makes no sense."""
+        if frame.id == self._request_id:
+            if len(frame.data) == 3 and frame.data[0] == 0xD8:
+                return LogOn(frame.data[1], frame.data[2])
+            self.counters["foreign_requests"] += 1
+            return None
+        if frame.id != self._data_id:
+            self.counters["foreign_frames"] += 1
+            return None
+        item = ITEMS.get(int.from_bytes(frame.data[:2], "big")) if len(frame.data) > 2 else None
+        if item is not None:
+            head = 3 if item.per_channel else 2
+            if len(frame.data) == head + struct.calcsize(">" + item.format):
+                (value,) = struct.unpack_from(">" + item.format, frame.data, head)
+                return Data(item, frame.data[2] if item.per_channel else None, value)
+        self.counters["bad_frames"] += 1
+        return None
+
+
+def hv_flags(status: ChannelStatus, events: ChannelEvents, module: ModuleStatus) -> HVFlag:
+    """What a channel's status, its latched events and its module's status mean for any supply.
+
+    Latched events that block the channel count as present until they are cleared.
+    """
+    flags = HVFlag(0)
+    for flag, present in (
+        (HVFlag.ON, status & ChannelStatus.ON),
+        (HVFlag.RAMPING, status & ChannelStatus.RAMPING),
+        (
+            HVFlag.VOLTAGE_LIMIT,
+            status & (ChannelStatus.VOLTAGE_LIMIT | ChannelStatus.VOLTAGE_BOUNDS)
+            or events & ChannelEvents.VOLTAGE_LIMIT,
+        ),
+        (
+            HVFlag.CURRENT_LIMIT,
+            status & (ChannelStatus.CURRENT_LIMIT | ChannelStatus.CURRENT_BOUNDS | ChannelStatus.CONSTANT_CURRENT)
+            or events & ChannelEvents.CURRENT_LIMIT,
+        ),
+        (HVFlag.TRIPPED, status & ChannelStatus.TRIP or events & ChannelEvents.TRIP),
+        (HVFlag.INHIBITED, status & ChannelStatus.EXTERNAL_INHIBIT or events & ChannelEvents.EXTERNAL_INHIBIT),
+        (HVFlag.EMERGENCY_OFF, status & ChannelStatus.EMERGENCY_OFF or events & ChannelEvents.EMERGENCY_OFF),
+        (HVFlag.ARC, status & (ChannelStatus.ARC | ChannelStatus.ARC_ERROR)),
+        (HVFlag.INTERLOCK_OPEN, ~module & ModuleStatus.SAFETY_LOOP_GOOD),
+        (
+            HVFlag.FAULT,
+            status & ChannelStatus.INPUT_ERROR
+            or ~module
+            & (
+                ModuleStatus.TEMPERATURE_GOOD
+                | ModuleStatus.SUPPLY_GOOD
+                | ModuleStatus.MODULE_GOOD
+                | ModuleStatus.HARDWARE_VOLTAGE_LIMIT_GOOD
+            ),
+        ),
+    ):
+        if present:
+            flags |= flag
+    return flags
+
+
+class _Exchange:
+    """A read, with writes that go out before it: each time, or (``once``) only with its first transmission."""
+
+    def __init__(
+        self, item: Item, channel: int | None, writes: tuple[CanFrame, ...] = (), *, once: bool = False
+    ) -> None:
+        self.item = item
+        self.channel = channel
+        self.writes = writes
+        self.once = once
+        self.everyone: set[int] = set()  # channels to be read at once with one request
+
+    def __str__(self) -> str:
+        return self.item.title + ("" if self.channel is None else f" of channel {self.channel}")
+
+
+Script = Generator[Ask[_Exchange], Answer[Message], T]
+
+_ATTEMPTS = 3
+_SURVEY_S = 1.0  # how often the other channels of the module are looked at
+_SWITCH_ON_LOOKS, _SWITCH_ON_WAIT_S = 5, 0.02
+
+
+class IsegEDCP:
+    """One channel of an iseg module as an `drivers.roles.HVSupply`.
+
+    Set-up registers the module and reads; it writes nothing else, so a channel that is found switched on stays as it
+    is and shows in the samples. Each sample takes five reads at ``poll_rate_Hz`` (measured voltage and current,
+    set-point, channel status and events) and one of the module's status; they also keep the registration alive. If
+    the module has other channels, their status is read once a second into ``channel_status``.
+
+    A command writes and reads back; a write that got lost is repeated, except switching on. A command that fails
+    raises from ``poll`` and takes the commands queued behind it with it. ``emergency_off`` drops whatever is queued or
+    under way and is sent by the next poll, answered or not; if it is not confirmed, all modules on the bus are told.
+    ``switch_off`` drops it too, except a ramp that was asked for, which is written first.
+
+    Parameters
+    ----------
+    module, channel : int
+        Module number 0 to 63 on the bus, channel 0 to 255 in it.
+    poll_rate_Hz : float
+        Samples per second.
+    timeout_s : float
+        How long to wait for each answer; a read is repeated twice.
+    max_ramp_percent_per_s : float
+        Fastest voltage ramp that the module accepts, in percent of its nominal voltage per second.
+    """
+
+    measures_current = True
+
+    def __init__(
+        self,
+        name: str,
+        link: FrameLink,
+        *,
+        module: int = 0,
+        channel: int = 0,
+        poll_rate_Hz: float = 10.0,
+        timeout_s: float = 0.25,
+        max_ramp_percent_per_s: float = 20.0,
+    ) -> None:
+        where = label(name, link)
+        if not 0 <= module <= 63:
+            raise DeviceRefused(where, f"module number {module} does not exist", "Allowed: 0 to 63.")
+        if not 0 <= channel <= 255:
+            raise DeviceRefused(
+                where, f"channel {channel} does not exist", "Allowed: 0 to 255, as the module has them."
+            )
+        if not 0 < poll_rate_Hz <= 100:
+            raise DeviceRefused(where, f"poll rate {poll_rate_Hz} Hz is not possible", "Allowed: above 0, at most 100.")
+        self.name = name
+        self._label = where
+        self.identity = Identity(model="iseg EDCP")
+        self.settings: dict[str, str] = {}
+        self.counters: dict[str, int] = {"log_ons": 0, "unexpected_frames": 0, "bad_values": 0, "writes_repeated": 0}
+        self.channel_status: dict[int, ChannelStatus] = {}
+        """Last seen status of every channel of the module, if it has more than one."""
+        self._link = link
+        self._module = module
+        self._channel = channel
+        self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
+        self._max_ramp = max_ramp_percent_per_s
+        self._decoder = Decoder(module, self.counters)
+        self._dialogue: Dialogue[_Exchange, Message] = Dialogue(
+            where,
+            self._transmit,
+            self.counters,
+            timeout_s=timeout_s,
+            advice=f"Check power, CAN cable and termination, bit rate, and that module {module} is its address.",
+        )
+        self._exchange: _Exchange | None = None
+        self._collected: dict[int, Message] = {}
+        self._nominal = (math.nan, math.nan)
+        self._channels = 1
+        self._ready = self._lost_settings = False
+        self._wanted_ramp: float | None = None  # percent per second, asked for and not confirmed yet
+        self._commands = 0
+        self._inbox: deque[CanFrame] = deque()
+        self._samples: list[HVSample] = []
+        self._next_survey = -math.inf
+        self._next_poll = -math.inf
+
+    # -- role -------------------------------------------------------------------------------------------------------
+
+    @property
+    def ready(self) -> bool:
+        return self._ready
+
+    @property
+    def next_poll(self) -> float:
+        return self._next_poll
+
+    @property
+    def nominal(self) -> tuple[float, float]:
+        """(volts, amperes) read from the channel; NaN until then."""
+        return self._nominal
+
+    @property
+    def fastest_ramp(self) -> float:
+        """V/s, of the nominal voltage; NaN until that is known."""
+        return self._max_ramp / 100 * self._nominal[0]
+
+    @property
+    def busy(self) -> bool:
+        return self._commands > 0
+
+    def set_ramp(self, volts_per_second: float) -> None:
+        """Set the module's ramp, which it keeps as percent of nominal voltage per second, for all its channels."""
+        self._require_ready("set the ramp")
+        percent = 100.0 * volts_per_second / self._nominal[0]
+        if not 0.0 < percent <= self._max_ramp * (1 + 1e-6):
+            raise DeviceRefused(
+                self._label,
+                f"a ramp of {volts_per_second:g} V/s is {percent:g} % of {self._nominal[0]:g} V per second",
+                f"The module allows above 0, at most {self._max_ramp:g} %/s: "
+                f"{self._max_ramp / 100 * self._nominal[0]:g} V/s.",
+            )
+        self._wanted_ramp = percent
+        self._command(self._write_ramp(percent))
+
+    def set_current_limit(self, amperes: float) -> None:
+        self._require_ready("set the current limit")
+        if not 0.0 < amperes <= self._nominal[1]:
+            raise DeviceRefused(
+                self._label,
+                f"a current limit of {amperes:g} A is outside the channel's range",
+                f"Allowed: above 0, at most {self._nominal[1]:g} A.",
+            )
+        self._command(self._write_setting(SET_CURRENT, amperes, self._channel, "current_limit_A"))
+
+    def set_voltage(self, volts: float) -> None:
+        self._require_ready("set the voltage")
+        if not 0.0 <= volts <= self._nominal[0]:
+            raise DeviceRefused(
+                self._label,
+                f"a set-point of {volts:g} V is outside the channel's range",
+                f"Allowed: 0 to {self._nominal[0]:g} V.",
+            )
+        self._command(self._write_checked(SET_VOLTAGE, volts, self._channel))
+
+    def switch_on(self) -> None:
+        self._require_ready("switch on")
+        self._command(self._switch_on())
+
+    def switch_off(self) -> None:
+        self._dialogue.clear()  # nothing that was queued before may switch on after it
+        self._commands = 0
+        self._command(self._switch_off())
+
+    def emergency_off(self) -> None:
+        self._dialogue.clear()
+        self._commands = 0
+        self._wanted_ramp = None
+        self._command(self._emergency_off())
+
+    def clear(self) -> None:
+        self._command(self._clear())
+
+    def close(self) -> None:
+        self._link.close()
+
+    # -- beyond the role --------------------------------------------------------------------------------------------
+
+    def set_kill(self, enabled: bool) -> None:
+        """Kill enabled: a channel that exceeds its limits is shut off for good; else it is cut and ramps up again."""
+        self._command(self._write_kill(enabled))
+
+    def set_trip(self, delay_s: float, action: int) -> None:
+        """What the module does after the current has been at its limit for ``delay_s``: see `TRIP_ACTIONS`."""
+        if not 0.0 <= delay_s <= 4.095:
+            raise DeviceRefused(self._label, f"a trip delay of {delay_s:g} s is not possible", "Allowed: 0 to 4.095 s.")
+        if action not in TRIP_ACTIONS:
+            allowed = ", ".join(f"{code} {text}" for code, text in TRIP_ACTIONS.items())
+            raise DeviceRefused(self._label, f"trip action {action} does not exist", f"Allowed: {allowed}.")
+        self._command(self._write_setting(TRIP_DELAY, round(delay_s * 1000), self._channel, "trip_delay_ms"))
+        self._command(self._write_setting(TRIP_ACTION, action, self._channel, "trip_action"))
+
+    def set_bounds(self, volts: float, amperes: float) -> None:
+        """Deviation of voltage and current from their set-points beyond which the channel reports a bounds error."""
+        self._require_ready("set bounds")
+        if not (0.0 <= volts <= self._nominal[0] and 0.0 <= amperes <= self._nominal[1]):
+            raise DeviceRefused(
+                self._label,
+                f"bounds of {volts:g} V and {amperes:g} A are outside the channel's range",
+                f"Allowed: 0 to {self._nominal[0]:g} V and 0 to {self._nominal[1]:g} A.",
+            )
+        self._command(self._write_setting(VOLTAGE_BOUNDS, volts, self._channel, "voltage_bounds_V"))
+        self._command(self._write_setting(CURRENT_BOUNDS, amperes, self._channel, "current_bounds_A"))
+
+    # -- polling ----------------------------------------------------------------------------------------------------
+
+    def poll(self, now: float) -> Sequence[HVSample]:
+        self._next_poll = now + LOST_AGAIN_S
+        self._inbox.extend(self._link.read())
+        while self._inbox:  # an error that an answer brings on leaves the others for the next poll
+            message = self._decoder.feed(self._inbox.popleft())
+            if isinstance(message, LogOn):
+                self.counters["log_ons"] += 1
+                self._link.write(log_on(self._module))
+                self._lost_settings = True  # it may have been switched off and on, and lost what was set
+            elif message is not None and not self._dialogue.offer(message, now) and not self._collect(message):
+                self.counters["unexpected_frames"] += 1
+        if self._dialogue.idle:
+            if not self._ready:
+                self._link.write(log_on(self._module))
+                self._dialogue.begin(self._set_up())
+            elif self._schedule.take(now):
+                self._dialogue.begin(self._cycle(now))
+        self._dialogue.run(now)
+        if self._ready and math.isinf(self._schedule.due):
+            self._schedule.start(now)
+        self._next_poll = min(self._schedule.due if self._dialogue.idle else math.inf, self._dialogue.next_poll(now))
+        samples, self._samples = self._samples, []
+        return samples
+
+    def _command(self, script: Script[None]) -> None:
+        self._commands += 1
+        self._dialogue.begin(self._tracked(script))
+        self._next_poll = -math.inf
+
+    def _tracked(self, script: Script[None]) -> Script[None]:
+        try:
+            yield from script
+        except DeviceError:
+            self._dialogue.clear()
+            self._commands = 0
+            raise
+        finally:
+            self._commands = max(0, self._commands - 1)
+
+    def _require_ready(self, what: str) -> None:
+        if not self._ready:
+            raise DeviceRefused(self._label, f"cannot {what} before the set-up dialogue has ended", "Poll it first.")
+
+    def _transmit(self, exchange: _Exchange) -> Callable[[Message], bool]:
+        for frame in exchange.writes:
+            self._link.write(frame)
+        if exchange.once:
+            exchange.writes = ()
+        self._exchange = exchange
+        self._collected = {}
+        if exchange.everyone:
+            self._link.write(read_many(self._module, exchange.item, exchange.everyone))
+            return self._completes
+        self._link.write(read_request(self._module, exchange.item, exchange.channel))
+        return lambda m: isinstance(m, Data) and m.item is exchange.item and m.channel == exchange.channel
+
+    def _completes(self, message: Message) -> bool:
+        assert self._exchange is not None
+        return self._collect(message) and self._collected.keys() == self._exchange.everyone
+
+    def _collect(self, message: Message) -> bool:
+        """Keep an answer to a request to several channels."""
+        exchange = self._exchange
+        if exchange is None or not isinstance(message, Data) or message.item is not exchange.item:
+            return False
+        if message.channel not in exchange.everyone:
+            return False
+        self._collected[message.channel] = message
+        return True
+
+    # -- dialogue ---------------------------------------------------------------------------------------------------
+
+    def _read(
+        self, item: Item, writes: tuple[CanFrame, ...] = (), *, once: bool = False, delay_s: float = 0.0
+    ) -> Script[Answer[Message]]:
+        channel = self._channel if item.per_channel else None
+        return (yield Ask(_Exchange(item, channel, writes, once=once), delay_s=delay_s))
+
+    def _integer(
+        self, item: Item, writes: tuple[CanFrame, ...] = (), *, once: bool = False, delay_s: float = 0.0
+    ) -> Script[int]:
+        value = _value((yield from self._read(item, writes, once=once, delay_s=delay_s)))
+        assert isinstance(value, int)
+        return value
+
+    def _number(self, item: Item, limit: float) -> Script[tuple[float, float]]:
+        """(value, time) of a float; one that is not finite or beyond ``limit`` is dropped, counted and read again."""
+        value = math.nan
+        for _ in range(_ATTEMPTS):
+            answer = yield from self._read(item)
+            read = _value(answer)
+            assert isinstance(read, float)
+            value = read
+            if abs(value) <= limit:
+                return value, answer.t
+            self.counters["bad_values"] += 1
+        raise DeviceRefused(
+            self._label,
+            f"reports {value:g} as {item.title}",
+            f"Possible: at most {limit:g}. Switch off by hand and check the module.",
+        )
+
+    def _optional(self, item: Item, *, repeat: bool = False) -> Script[Value | None]:
+        """The value of a module item that not every module has: not having it means not answering."""
+        try:
+            return _value((yield Ask(_Exchange(item, None), repeat=repeat)))
+        except DeviceSilent:
+            return None
+
+    def _set_up(self) -> Script[None]:
+        foreign = self.counters["foreign_requests"]
+        yield from self._integer(MODULE_STATUS)
+        if self.counters["foreign_requests"] != foreign:
+            raise DeviceRefused(
+                self._label,
+                f"someone else reads from module {self._module}, or the CAN interface returns its own frames",
+                "Writes could not be verified. End the other program, or switch receive_own_messages off.",
+            )
+        serial = yield from self._optional(SERIAL_NUMBER, repeat=True)
+        release = yield from self._optional(FIRMWARE_RELEASE)
+        firmware = yield from self._optional(FIRMWARE_NAME)
+        channels = yield from self._optional(CHANNEL_COUNT)
+        self._channels = channels if isinstance(channels, int) else 1
+        if isinstance(channels, int) and not self._channel < channels:
+            raise DeviceRefused(
+                self._label,
+                f"module {self._module} has {channels} channel(s), but channel {self._channel} was asked for",
+                f"Channels count from 0: allowed is 0 to {channels - 1}.",
+            )
+        self.identity = identity(serial, release, firmware)
+        volts, _ = yield from self._number(NOMINAL_VOLTAGE, 1e6)
+        amperes, _ = yield from self._number(NOMINAL_CURRENT, 1e3)
+        if not (volts > 0 and amperes > 0):
+            raise DeviceRefused(
+                self._label,
+                f"states nominal values of {volts:g} V and {amperes:g} A",
+                "Only positive ones are supported.",
+            )
+        self._nominal = (volts, amperes)
+        yield from self._read_settings()
+        setpoint, _ = yield from self._number(SET_VOLTAGE, 2 * volts)
+        status = yield from self._integer(CHANNEL_STATUS)
+        self.settings |= {
+            "nominal_voltage_V": f"{volts:.9g}",
+            "nominal_current_A": f"{amperes:.9g}",
+            "setpoint_at_setup_V": f"{setpoint:.9g}",
+            "channel_at_setup": "on" if status & ChannelStatus.ON else "off",
+            "channels": str(self._channels),
+        }
+        self._ready = True
+
+    def _read_settings(self) -> Script[None]:
+        volts, amperes = self._nominal
+        limit, _ = yield from self._number(SET_CURRENT, 2 * amperes)
+        ramp, _ = yield from self._number(MODULE_RAMP, 1e3)
+        module = yield from self._integer(MODULE_STATUS)
+        self.settings |= {
+            "ramp_percent_per_s": f"{ramp:.9g}",
+            "ramp_V_per_s": f"{ramp / 100 * volts:.9g}",
+            "current_limit_A": f"{limit:.9g}",
+            "kill_enabled": "yes" if module & ModuleStatus.KILL_ENABLED else "no",
+        }
+
+    def _cycle(self, now: float) -> Script[None]:
+        volts, amperes = self._nominal
+        voltage, t = yield from self._number(MEASURED_VOLTAGE, 2 * volts)
+        current, _ = yield from self._number(MEASURED_CURRENT, 10 * amperes)
+        setpoint, _ = yield from self._number(SET_VOLTAGE, 2 * volts)
+        status = yield from self._integer(CHANNEL_STATUS)
+        events = yield from self._integer(CHANNEL_EVENTS)
+        module = yield from self._integer(MODULE_STATUS)
+        flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module))
+        self._samples.append(HVSample(t, voltage, current, setpoint, flags))
+        if self._lost_settings:
+            self._lost_settings = False
+            yield from self._read_settings()
+        if self._channels > 1 and now >= self._next_survey:
+            self._next_survey = now + _SURVEY_S
+            yield from self._survey()
+
+    def _survey(self) -> Script[None]:
+        exchange = _Exchange(CHANNEL_STATUS, None)
+        exchange.everyone = set(range(min(self._channels, 16)))
+        yield Ask(exchange)
+        for channel, message in self._collected.items():
+            assert isinstance(message, Data) and isinstance(message.value, int)
+            self.channel_status[channel] = ChannelStatus(message.value)
+
+    # -- commands ---------------------------------------------------------------------------------------------------
+
+    def _write_checked(self, item: Item, value: float, channel: int | None) -> Script[None]:
+        """Write and read back; a write that did not take is repeated, since writes may get lost unnoticed."""
+        frame = write(self._module, item, value, channel)
+        for attempt in range(_ATTEMPTS):
+            self.counters["writes_repeated"] += attempt > 0
+            read_back = _value((yield from self._read(item, (frame,))))
+            if read_back == value or (isinstance(read_back, float) and math.isclose(read_back, value, rel_tol=1e-5)):
+                return
+        raise DeviceRefused(
+            self._label,
+            f"{item.title} reads back as {read_back!r} after {value!r} was written",
+            "The module does not accept it: check its limits, its state, and who else commands it.",
+        )
+
+    def _write_setting(self, item: Item, value: float, channel: int | None, key: str) -> Script[None]:
+        yield from self._write_checked(item, value, channel)
+        self.settings[key] = f"{value:.9g}"
+
+    def _write_ramp(self, percent: float) -> Script[None]:
+        yield from self._write_setting(MODULE_RAMP, percent, None, "ramp_percent_per_s")
+        self.settings["ramp_V_per_s"] = f"{percent / 100 * self._nominal[0]:.9g}"
+        self._wanted_ramp = None
+
+    def _write_kill(self, enabled: bool) -> Script[None]:
+        control = ModuleControl((yield from self._integer(MODULE_CONTROL)))
+        control = control | ModuleControl.KILL if enabled else control & ~ModuleControl.KILL
+        yield from self._write_checked(MODULE_CONTROL, int(control), None)
+        self.settings["kill_enabled"] = "yes" if enabled else "no"
+
+    def _switch_on(self) -> Script[None]:
+        status = ChannelStatus((yield from self._integer(CHANNEL_STATUS)))
+        events = ChannelEvents((yield from self._integer(CHANNEL_EVENTS))) & BLOCKING
+        if events or status & ChannelStatus.EMERGENCY_OFF:
+            causes = _names(events) or "EMERGENCY_OFF"
+            raise DeviceRefused(
+                self._label, f"is not switched on while {causes} is latched", "Find the cause, then clear."
+            )
+        if status & ChannelStatus.ON:
+            return
+        # Written once only: a channel that trips at once must not be switched on again by a repetition.
+        frame = write(self._module, CHANNEL_CONTROL, int(ChannelControl.ON), self._channel)
+        control = yield from self._integer(CHANNEL_CONTROL, (frame,), once=True)
+        for _ in range(_SWITCH_ON_LOOKS):
+            status = ChannelStatus((yield from self._integer(CHANNEL_STATUS)))
+            if status & ChannelStatus.ON and control & ChannelControl.ON:
+                return
+            control = yield from self._integer(CHANNEL_CONTROL, delay_s=_SWITCH_ON_WAIT_S)
+        events = ChannelEvents((yield from self._integer(CHANNEL_EVENTS)))
+        raise DeviceRefused(
+            self._label,
+            f"did not switch on: control {control:04X}, status {_names(status) or 'off'}, "
+            f"events {_names(events & BLOCKING) or 'none'}",
+            "Check safety loop, inhibit input and limits, then try again.",
+        )
+
+    def _switch_off(self) -> Script[None]:
+        """Ramp down and switch off, at the ramp that was asked for last; if it cannot be set, at the module's own."""
+        refused: DeviceError | None = None
+        if self._wanted_ramp is not None:
+            try:
+                yield from self._write_ramp(self._wanted_ramp)
+            except DeviceError as error:
+                refused = error
+        # An emergency off stays latched: only `clear` takes it back.
+        latched = ChannelControl((yield from self._integer(CHANNEL_CONTROL))) & ChannelControl.EMERGENCY_OFF
+        yield from self._write_checked(CHANNEL_CONTROL, int(latched), self._channel)
+        if refused is not None:
+            raise refused
+
+    def _emergency_off(self) -> Script[None]:
+        try:
+            yield from self._write_checked(CHANNEL_CONTROL, int(ChannelControl.EMERGENCY_OFF), self._channel)
+        except DeviceError as error:
+            self._link.write(EMERGENCY_OFF_ALL)
+            raise type(error)(
+                self._label,
+                f"EMERGENCY OFF IS NOT CONFIRMED ({error.what}); it was sent to all modules on the bus as well",
+                "Take the high voltage away by hand: safety loop or mains switch, then ground the electrodes.",
+            ) from error
+
+    def _clear(self) -> Script[None]:
+        yield from self._write_checked(CHANNEL_CONTROL, 0, self._channel)
+        yield from self._acknowledge(MODULE_EVENTS, None)
+        left = ChannelEvents((yield from self._acknowledge(CHANNEL_EVENTS, self._channel))) & BLOCKING
+        if left:
+            raise DeviceRefused(
+                self._label, f"{_names(left)} comes back after it was cleared", "Its cause persists: remove it first."
+            )
+
+    def _acknowledge(self, item: Item, channel: int | None) -> Script[int]:
+        """Clear the latched bits of an event register by writing them back; returns what is left."""
+        events = yield from self._integer(item)
+        for _ in range(_ATTEMPTS):
+            if not events:
+                break
+            events = yield from self._integer(item, (write(self._module, item, events, channel),))
+        return events
+
+
+def _value(answer: Answer[Message]) -> Value:
+    assert isinstance(answer.message, Data)
+    return answer.message.value
+
+
+def _names(flags: IntFlag) -> str:
+    return " ".join(str(flag.name) for flag in flags)

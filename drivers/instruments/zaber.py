@@ -1,0 +1,691 @@
+r"""Zaber linear stages (X-LSQ and relatives) over the Zaber ASCII protocol, 115200 baud 8N1.
+
+A command is ``/1 1 07 move abs 2000:CC\n``: device, axis, message id, words, checksum. What comes back is sorted by
+its first character: ``@`` a reply (``@01 1 07 OK BUSY -- 0:CC\r\n``), ``#`` info that follows a reply, ``!`` an alert
+that may come at any time, also between a command and its reply. BUSY or IDLE is the state after the command was
+accepted; the two letters that follow are the highest-priority warning flag, ``--`` for none. A packet that is too
+long ends in ``\`` and goes on in ``#01 1 07 cont ...``.
+
+The checksum is the negative sum, modulo 256, of the bytes between the first character and the colon. It shows every
+change of a single byte; two changes that cancel each other pass it (one in 256 of random damage), so numbers are
+also held to a strict grammar and replies to the message id that was asked.
+
+Positions are whole microsteps. One microstep is the screw's travel per full motor step divided by the device's
+``resolution``, which is read from the device; speeds are in units of 1/1.6384 microstep per second.
+
+Source: Zaber ASCII Protocol Manual; flag and reject words as in zaber-motion and zproto.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
+
+from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.lines import LineSplitter
+from drivers.links.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
+from drivers.roles import Identity, StageSample
+
+WARNINGS = {
+    "FF": "critical system error",
+    "FN": "peripheral not supported",
+    "FZ": "peripheral inactive",
+    "FH": "hardware emergency stop pressed",
+    "FV": "supply over- or undervoltage, driver disabled",
+    "FO": "driver disabled by command",
+    "FC": "inrush current error, driver disabled",
+    "FM": "motor too hot, driver disabled",
+    "FD": "driver disabled",
+    "FQ": "encoder error",
+    "FI": "index error",
+    "FA": "analog encoder lost synchronisation",
+    "FR": "overdrive limit exceeded, driver disabled",
+    "FS": "stalled and stopped",
+    "FB": "stream left its bounds",
+    "FP": "deviated from the path",
+    "FE": "limit error",
+    "FT": "excessive twist",
+    "WL": "unexpected limit trigger",
+    "WV": "supply voltage out of range",
+    "WT": "controller hot",
+    "WS": "stalled, recovered",
+    "WM": "displaced while standing still",
+    "WP": "calibration of the wrong type",
+    "WR": "no reference position",
+    "WH": "not homed",
+    "NC": "manual control by the knob",
+    "NI": "movement interrupted by another command",
+    "ND": "stream ran dry",
+    "NR": "value rounded",
+    "NT": "value truncated",
+    "NU": "setting takes effect later",
+    "NJ": "joystick calibrating",
+}
+"""Warning flags; F is a fault (motion stopped or refused), W a warning, N a note."""
+
+UNREFERENCED = frozenset({"WR", "WH"})
+
+REJECTIONS = {
+    "BADCOMMAND": ("it does not know the command", "Check the firmware version; the command may need a newer one."),
+    "BADDATA": ("a value is out of range", "Keep the position within the travel and the speed below the maximum."),
+    "BADAXIS": ("it has no such axis", "Check `axis` in the scene."),
+    "BADMESSAGEID": ("the message id was not understood", "Check the line for noise."),
+    "STATUSBUSY": ("it cannot do that while moving", "Wait until it stands still."),
+    "DEVICEONLY": ("the command is for the device, not an axis", "This is a fault of the driver: report it."),
+    "AXISONLY": ("the command is for an axis, not the device", "This is a fault of the driver: report it."),
+    "NOACCESS": ("the command needs a higher access level", "Set system.access in the maker's software."),
+    "INACTIVE": ("the axis is inactive", "Plug in the peripheral and activate it in the maker's software."),
+    "NOTSUPPORTED": ("the command is not supported on this stage", "Check the stage's model."),
+    "DRIVERDISABLED": ("the motor driver is disabled", "Look for a fault flag, remove its cause, and power-cycle it."),
+    "LONGWORD": ("a word of the command is too long", "This is a fault of the driver: report it."),
+    "CYCLICONLY": ("the command is for rotary stages", "Check the stage's model."),
+    "BADSPLIT": ("a continued command was broken", "Check the line for noise."),
+    "PARKED": ("the stage is parked", "Unpark it in the maker's software, or home it."),
+    "REMOTE": ("the stage is under remote control", "End the other program that controls it."),
+    "FULL": ("its storage is full", "Free space in the maker's software."),
+    "AGAIN": ("it is busy at the moment", "Try again."),
+}
+"""Why a command was rejected, and what to do."""
+
+VELOCITY_UNIT = 1.6384  # velocity data per microstep/s; acceleration data per 10 000 microsteps/s^2
+T = TypeVar("T")
+
+_MAX_LINE = 512  # devices send 80 characters a packet; settings raise that to some hundred
+_MAX_PARTS = 16
+_CHECKSUMMED = re.compile(r"(.*):([0-9A-F]{2})", re.DOTALL)
+_REPLY = re.compile(r"([0-9]{2}) ([0-9])(?: ([0-9]{2}))? (OK|RJ) (BUSY|IDLE) (--|[A-Z]{2}) (.+)")
+_ALERT = re.compile(r"([0-9]{2}) ([0-9]) (BUSY|IDLE) (--|[A-Z]{2})(?: (.*))?")
+_INFO = re.compile(r"([0-9]{2}) ([0-9])(?: ([0-9]{2})(?= ))? (.*)")
+_WHOLE = re.compile(r"-?[0-9]{1,10}")
+_FLAGS = re.compile(r"([0-9]{2})((?: [A-Z]{2})*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """``@``: the answer to one command. ``id`` is None when the command carried none."""
+
+    device: int
+    axis: int
+    id: int | None
+    accepted: bool
+    busy: bool
+    warning: str
+    data: str
+
+
+@dataclass(frozen=True, slots=True)
+class Info:
+    """``#``: text that follows a reply."""
+
+    device: int
+    axis: int
+    id: int | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Alert:
+    """``!``: sent by the device on its own, when motion ends or a warning appears."""
+
+    device: int
+    axis: int
+    busy: bool
+    warning: str
+    data: str
+
+
+Message = Reply | Info | Alert
+
+
+def checksum(text: bytes) -> int:
+    """Longitudinal redundancy check of what stands between the first character and the colon."""
+    return -sum(text) & 0xFF
+
+
+def encode(device: int, axis: int, message_id: int, words: str) -> bytes:
+    """A command with message id and checksum, e.g. ``/1 0 00 get pos:2D``; without words it asks for the state."""
+    text = f"{device} {axis} {message_id:02d}" + (f" {words}" if words else "")
+    return f"/{text}:{checksum(text.encode('ascii')):02X}\n".encode("ascii")
+
+
+class Codec:
+    """Bytes from the stage to messages.
+
+    A line with a wrong checksum, or that fits no grammar, is dropped and counted. Lines without a checksum are taken
+    only until the first one with a valid checksum has been seen: from then on the device is known to send them. Alerts
+    count for themselves: a device may send checksums only in reply to a command that had one.
+
+    ``counters``: ``bad_checksum``, ``without_checksum`` (dropped for it), ``bad_grammar``, ``too_long``,
+    ``lost_continuation`` (packets whose rest never came, or the rest of a packet never seen).
+    """
+
+    def __init__(self, counters: dict[str, int] | None = None) -> None:
+        self.counters = {} if counters is None else counters
+        for key in ("bad_checksum", "without_checksum", "bad_grammar", "lost_continuation"):
+            self.counters.setdefault(key, 0)
+        self.checksums_seen = self._alert_checksums_seen = False
+        self._lines = LineSplitter(b"\n", _MAX_LINE, self.counters)
+        self._unfinished: dict[tuple[int, int, int | None], list[Reply | Info]] = {}
+
+    def feed(self, data: bytes) -> list[Message]:
+        """The messages that ``data`` completes, in order."""
+        messages = (self._line(line.removesuffix(b"\r")) for line in self._lines.feed(data))
+        return [message for message in messages if message is not None]
+
+    def _line(self, line: bytes) -> Message | None:
+        if not line:
+            return None
+        text = line.decode("ascii", "replace")
+        if not (text.isascii() and text.isprintable()):
+            self.counters["bad_grammar"] += 1
+            return None
+        kind, body = text[0], text[1:]
+        checked = _CHECKSUMMED.fullmatch(body)
+        if checked:
+            body = checked[1]
+            if checksum(body.encode("ascii")) != int(checked[2], 16):
+                self.counters["bad_checksum"] += 1
+                return None
+        elif self._alert_checksums_seen if kind == "!" else self.checksums_seen:
+            self.counters["without_checksum"] += 1
+            return None
+        to_be_continued = body.endswith("\\")
+        message = _parse(kind, body.removesuffix("\\"))
+        if message is None or (to_be_continued and isinstance(message, Alert)):
+            self.counters["bad_grammar"] += 1
+            return None
+        if isinstance(message, Alert):
+            self._alert_checksums_seen |= checked is not None
+            return message
+        self.checksums_seen |= checked is not None
+        if isinstance(message, Info) and message.text.startswith("cont "):
+            return self._next_part(message, to_be_continued)
+        return self._first_part(message, to_be_continued)
+
+    def _first_part(self, message: Reply | Info, to_be_continued: bool) -> Message | None:
+        key = (message.device, message.axis, message.id)
+        if self._unfinished.pop(key, None) is not None:
+            self.counters["lost_continuation"] += 1
+        if not to_be_continued:
+            return message
+        if len(self._unfinished) >= _MAX_PARTS:
+            del self._unfinished[next(iter(self._unfinished))]
+            self.counters["lost_continuation"] += 1
+        self._unfinished[key] = [message]
+        return None
+
+    def _next_part(self, part: Info, to_be_continued: bool) -> Message | None:
+        key = (part.device, part.axis, part.id)
+        parts = self._unfinished.get(key)
+        if parts is None or len(parts) >= _MAX_PARTS:
+            self._unfinished.pop(key, None)
+            self.counters["lost_continuation"] += 1
+            return None
+        parts.append(part)
+        if to_be_continued:
+            return None
+        del self._unfinished[key]
+        text = " ".join([_text(parts[0]), *(_text(part).removeprefix("cont ") for part in parts[1:])])
+        first = parts[0]
+        return replace(first, data=text) if isinstance(first, Reply) else replace(first, text=text)
+
+
+def _parse(kind: str, body: str) -> Message | None:
+    if kind == "@" and (match := _REPLY.fullmatch(body)):
+        device, axis, message_id, verdict, state, warning, data = match.groups()
+        return Reply(
+            int(device), int(axis), _whole_or_none(message_id), verdict == "OK", state == "BUSY", warning, data
+        )
+    if kind == "#" and (match := _INFO.fullmatch(body)):
+        device, axis, message_id, text = match.groups()
+        return Info(int(device), int(axis), _whole_or_none(message_id), text)
+    if kind == "!" and (match := _ALERT.fullmatch(body)):
+        device, axis, state, warning, data = match.groups()
+        return Alert(int(device), int(axis), state == "BUSY", warning, data or "")
+    return None
+
+
+def _whole_or_none(digits: str | None) -> int | None:
+    return None if digits is None else int(digits)
+
+
+def _text(part: Reply | Info) -> str:
+    return part.data if isinstance(part, Reply) else part.text
+
+
+class _Command(NamedTuple):
+    words: str
+    axis: int
+
+    def __str__(self) -> str:
+        return self.words or "status"
+
+
+# One or more questions within a script, ending in a value.
+_Part = Generator[Ask[_Command], Answer[Reply], T]
+
+
+class ZaberStage:
+    """A `drivers.roles.Stage` on one axis of a Zaber device.
+
+    Set-up reads identity, resolution, travel and speed from the device, clears old warnings (kept in
+    ``settings["warnings_at_start"]``), locks the manual knob until `close`, and asks a device that answers without
+    checksums to send them from now on. After that the position is polled.
+
+    The stage refuses to move while it has no reference (warning flags WR, WH). When a reference it had is gone, most
+    likely because the device restarted, `poll` raises `DeviceRefused`; so it does, once, for each fault flag that
+    appears. A motion command whose reply is lost is not repeated before the state has been asked.
+
+    Parameters
+    ----------
+    name : str
+        The device's name in the scene.
+    link : ByteLink
+        Its serial line.
+    device, axis : int
+        Address on the line.
+    poll_rate_Hz : float
+        How often the position is asked for.
+    timeout_s : float
+        How long to wait for each reply.
+    full_step_um : float
+        Travel per full motor step: 31.75 um is a 6.35 mm screw on a motor of 200 steps, as in the X-LSQ150B.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        link: ByteLink,
+        *,
+        device: int = 1,
+        axis: int = 1,
+        poll_rate_Hz: float = 50.0,
+        timeout_s: float = 0.25,
+        full_step_um: float = 31.75,
+    ) -> None:
+        self.name = name
+        self.identity = Identity()
+        self.settings: dict[str, str] = {}
+        self.counters: dict[str, int] = {"alerts": 0, "infos": 0, "unexpected_replies": 0}
+        self._label = label(name, link)
+        self._link = link
+        self._device, self._axis = device, axis
+        self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
+        self._full_step = full_step_um * 1e-6
+        self._codec = Codec(self.counters)
+        self._dialogue: Dialogue[_Command, Reply] = Dialogue(
+            self._label, self._send, self.counters, timeout_s=timeout_s
+        )
+        # A stop does not wait for the answer to something else, so it has a dialogue of its own; ids keep them apart.
+        self._urgent: Dialogue[_Command, Reply] = Dialogue(
+            self._label,
+            self._send,
+            self.counters,
+            timeout_s=timeout_s,
+            retries=5,
+            advice="The stage may still be moving: cut its power.",
+        )
+        self._message_id = -1
+        self._inbox: deque[Message] = deque()
+        self._samples: list[StageSample] = []
+        self._now = self._next_poll = 0.0
+        self._ready = self._closed = False
+        self._waiting_commands = 0
+        self._next_motion: tuple[str, int | None] | None = None  # asked for, and not begun to be sent
+        self._shown = "--"  # the flag in the last reply
+        self._accepted_at = -math.inf
+        self._busy = self._homing = False
+        self._flags: tuple[str, ...] = ()
+        self._referenced = self._reference_lost = False
+        self._faults_told: set[str] = set()
+        self._step = math.nan
+        self._travel_steps = (0, 0)
+        self._acceleration = math.nan  # m/s^2
+        self._raw = 0
+        self._max_speed = self._max_speed_at_start = 0
+        self._knob_locked = False
+        self._dialogue.begin(self._set_up())
+
+    @property
+    def ready(self) -> bool:
+        return self._ready
+
+    @property
+    def next_poll(self) -> float:
+        return self._next_poll
+
+    @property
+    def travel(self) -> tuple[float, float]:
+        """(lowest, highest) position in metres; NaN before set-up has ended."""
+        low, high = self._travel_steps
+        return low * self._step, high * self._step
+
+    @property
+    def moving(self) -> bool:
+        return self._busy or self._waiting_commands > 0
+
+    @property
+    def referenced(self) -> bool:
+        return self._referenced
+
+    def braking_distance(self, speed: float) -> float:
+        """How far it goes on (m) when it brakes from ``speed`` (m/s); NaN before set-up has ended."""
+        return 0.5 * speed**2 / self._acceleration if self._acceleration != 0 else 0.0  # 0: it knows no ramp
+
+    def home(self) -> None:
+        """Drive to the home sensor, which gives the stage its reference."""
+        self._require_ready()
+        self._begin_motion("home")
+
+    def move_to(self, position: float, speed: float) -> None:
+        """Go to ``position`` (m) at ``speed`` (m/s); replaces a motion under way."""
+        self._require_reference()
+        low, high = self.travel
+        if not low <= position <= high:
+            raise DeviceRefused(
+                self._label,
+                f"position {position * 1e3:.6g} mm is outside the travel",
+                f"Allowed: {low * 1e3:.7g} to {high * 1e3:.7g} mm.",
+            )
+        if not 0 < speed < math.inf:
+            raise DeviceRefused(self._label, f"{speed * 1e3:.6g} mm/s is not a speed", "Give one above zero.")
+        target = min(max(round(position / self._step), self._travel_steps[0]), self._travel_steps[1])
+        self._begin_motion(f"move abs {target}", max_speed=max(1, self._speed_data(speed)))
+
+    def move_by(self, distance: float, speed: float) -> None:
+        """Go ``distance`` (m) further at ``speed`` (m/s), from a standstill.
+
+        Sent as an absolute move: unlike ``move rel`` it does no harm when it arrives twice.
+        """
+        self._require_reference()
+        if self.moving:
+            raise DeviceRefused(
+                self._label, "it is still moving; by how much to go on is not defined", "Stop it first."
+            )
+        self.move_to(self._raw * self._step + distance, speed)
+
+    def move_velocity(self, velocity: float) -> None:
+        """Move at ``velocity`` (m/s, negative towards home) until stopped or at the end of the travel."""
+        self._require_reference()
+        if not -math.inf < velocity < math.inf:
+            raise DeviceRefused(self._label, f"{velocity * 1e3:.6g} mm/s is not a speed", "Give a finite one.")
+        self._begin_motion(f"move vel {self._speed_data(velocity)}")
+
+    def stop(self) -> None:
+        """Decelerate to a standstill; overtakes everything queued."""
+        self._halt("stop")
+
+    def estop(self) -> None:
+        """Stop at once, without the deceleration ramp; overtakes everything queued."""
+        self._halt("estop")
+
+    def poll(self, now: float) -> Sequence[StageSample]:
+        self._now = now
+        try:
+            self._inbox.extend(self._codec.feed(self._link.read()))
+            while self._inbox:
+                self._take(self._inbox.popleft(), now)
+            if self._ready and self._dialogue.idle and self._schedule.take(now):
+                self._dialogue.begin(self._watch())
+            self._urgent.run(now)
+            self._dialogue.run(now)
+        except DeviceLost:
+            self._next_poll = now + LOST_AGAIN_S
+            raise
+        except DeviceError:
+            self._next_poll = now  # there may be more to read
+            raise
+        due = self._schedule.due if self._dialogue.idle else math.inf
+        self._next_poll = min(self._urgent.next_poll(now), self._dialogue.next_poll(now), due)
+        samples, self._samples = self._samples, []
+        return samples
+
+    def close(self) -> None:
+        """Stop if moving, give knob and speed back, all without waiting for replies, and release the line."""
+        if self._closed:
+            return
+        self._closed = True
+        with contextlib.suppress(DeviceError):
+            if self.moving:
+                self._send(_Command("stop", self._axis))
+            if self._max_speed != self._max_speed_at_start:
+                self._send(_Command(f"set maxspeed {self._max_speed_at_start}", self._axis))
+            if self._knob_locked:
+                self._send(_Command("set knob.enable 1", 0))
+        self._link.close()
+
+    def _send(self, command: _Command) -> Callable[[Reply], bool]:
+        self._message_id = (self._message_id + 1) % 100
+        expected = (self._device, command.axis, self._message_id)
+        self._link.write(encode(self._device, command.axis, self._message_id, command.words))
+        return lambda reply: (reply.device, reply.axis, reply.id) == expected
+
+    def _take(self, message: Message, now: float) -> None:
+        if isinstance(message, Alert):
+            self.counters["alerts"] += 1
+            self._schedule.start(now)  # something has changed: look at once
+        elif isinstance(message, Info):
+            self.counters["infos"] += 1
+        elif not (self._urgent.offer(message, now) or self._dialogue.offer(message, now)):
+            self.counters["unexpected_replies"] += 1
+
+    def _set_up(self) -> Script[_Command, Reply]:
+        yield from self._ask("", axis=0)
+        if not self._codec.checksums_seen:
+            yield from self._ask("set comm.checksum 1", axis=0, may_fail=True)
+        device_id = yield from self._number("get deviceid", axis=0)
+        serial = yield from self._number("get system.serial", axis=0)
+        version = (yield from self._ask("get version", axis=0)).message.data
+        self.identity = Identity(model=f"Zaber device {device_id}", serial=str(serial), firmware=version)
+        resolution = yield from self._number("get resolution")
+        low = yield from self._number("get limit.min")
+        high = yield from self._number("get limit.max")
+        max_speed = yield from self._number("get maxspeed")
+        acceleration = yield from self._number("get accel")
+        if not (resolution > 0 and low < high and max_speed > 0):
+            raise DeviceRefused(
+                self._label,
+                f"its settings make no sense: resolution {resolution}, limit.min {low}, limit.max {high}, "
+                f"maxspeed {max_speed}",
+                "Restore its settings in the maker's software.",
+            )
+        self._step = self._full_step / resolution
+        self._travel_steps = (low, high)
+        self._acceleration = acceleration * 1e4 / VELOCITY_UNIT * self._step
+        self._max_speed = self._max_speed_at_start = max_speed
+        # What is only history is cleared now, so that it is not blamed on this run; what is still there is the state.
+        yield from self._read_flags()
+        old_flags = self._flags
+        if old_flags:
+            yield from self._ask("warnings clear")
+            yield from self._read_flags()
+        knob = (yield from self._ask("set knob.enable 0", axis=0, may_fail=True)).message
+        self._knob_locked = knob.accepted
+        self.settings |= {
+            "deviceid": str(device_id),
+            "serial": str(serial),
+            "version": version,
+            "resolution": str(resolution),
+            "microstep_um": repr(self._step * 1e6),
+            "limit.min": str(low),
+            "limit.max": str(high),
+            "maxspeed": str(max_speed),
+            "accel": str(acceleration),
+            "warnings_at_start": " ".join(old_flags),
+            "knob": "locked" if knob.accepted else f"not locked: {knob.data}",
+            "reply_checksums": "yes" if self._codec.checksums_seen else "no",
+        }
+        self._schedule.start(self._now)
+        self._ready = True
+
+    def _watch(self) -> Script[_Command, Reply]:
+        """One position; and all flags when the one shown is not the first of those known, or motion has ended."""
+        was_busy = self._busy
+        answer = yield from self._ask("get pos")
+        raw = self._raw = self._whole(answer.message, "get pos")
+        shown = answer.message.warning
+        if shown == "--":
+            self._see_flags(())
+        elif self._flags[:1] != (shown,) or (was_busy and not self._busy):
+            yield from self._read_flags()
+        self._samples.append(StageSample(answer.t, raw * self._step, self.moving, self._referenced, raw, self._flags))
+        self._judge()
+
+    def _begin_motion(self, words: str, *, max_speed: int | None = None) -> None:
+        queued, self._next_motion = self._next_motion, (words, max_speed)
+        if queued is None:
+            self._waiting_commands += 1
+            self._dialogue.begin(self._motion())
+        self._next_poll = self._now
+
+    def _motion(self) -> Script[_Command, Reply]:
+        """The newest motion asked for: those that came while another was being sent have been replaced by it."""
+        assert self._next_motion is not None
+        (words, max_speed), self._next_motion = self._next_motion, None
+        try:
+            if not self._keeps_going(words):
+                yield from self._check_reference(words)
+                if self._flags:
+                    yield from self._ask("warnings clear")
+            if max_speed is not None and max_speed != self._max_speed:
+                yield from self._ask(f"set maxspeed {max_speed}")
+                self._max_speed = max_speed
+            was_busy = self._busy
+            try:
+                answer = yield from self._ask(words, repeat=False)
+            except DeviceSilent:
+                # Either the command or its reply was lost.
+                yield from self._check_reference(words)
+                if self._busy and not was_busy:
+                    self._homing = words == "home"
+                    return
+                answer = yield from self._ask(words, repeat=False)
+            self._homing = words == "home"
+            self._accept(answer)
+            if self._next_motion is not None and self._schedule.take(self._now):
+                yield from self._watch()  # however fast motions follow each other, positions come in between
+        finally:
+            self._waiting_commands -= 1
+
+    def _keeps_going(self, words: str) -> bool:
+        """Whether a motion only replaces one under way, whose last reply showed no more than a note.
+
+        A reply shows the weightiest flag; the lost reference and every fault weigh more than a note (N.).
+        """
+        shown = self._shown == "--" or self._shown.startswith("N")
+        return words.startswith("move abs") and self._busy and not self._homing and self._referenced and shown
+
+    def _check_reference(self, words: str) -> _Part[None]:
+        yield from self._read_flags()
+        self._judge()
+        if words != "home":
+            self._require_reference()
+
+    def _halt(self, words: str) -> None:
+        if self._ready:
+            self._dialogue.clear()
+        self._next_motion = None
+        self._urgent.clear()
+        self._waiting_commands = 1
+        self._urgent.begin(self._halting(words))
+        self._next_poll = self._now
+
+    def _halting(self, words: str) -> Script[_Command, Reply]:
+        try:
+            self._accept((yield from self._ask(words)))
+            self._homing = False
+        finally:
+            self._waiting_commands -= 1
+
+    def _accept(self, answer: Answer[Reply]) -> None:
+        """From here on only the reply to a later question can say that the stage stands still."""
+        self._busy = True
+        self._accepted_at = answer.received
+
+    def _ask(
+        self, words: str, *, axis: int | None = None, repeat: bool = True, may_fail: bool = False
+    ) -> _Part[Answer[Reply]]:
+        answer = yield Ask(_Command(words, self._axis if axis is None else axis), repeat=repeat)
+        reply = answer.message
+        self._shown = reply.warning
+        if reply.busy:
+            self._busy = True
+        elif answer.sent >= self._accepted_at:
+            self._busy = False
+        if not reply.accepted and not may_fail:
+            meaning, advice = REJECTIONS.get(reply.data, ("for a reason that this driver does not know", ""))
+            raise DeviceRefused(self._label, f"the stage rejected {words!r}: {meaning} ({reply.data})", advice)
+        return answer
+
+    def _number(self, words: str, axis: int | None = None) -> _Part[int]:
+        return self._whole((yield from self._ask(words, axis=axis)).message, words)
+
+    def _whole(self, reply: Reply, words: str) -> int:
+        if not _WHOLE.fullmatch(reply.data):
+            raise DeviceRefused(self._label, f"the stage answered {reply.data!r} to {words!r}, which is no number")
+        return int(reply.data)
+
+    def _read_flags(self) -> _Part[None]:
+        reply = (yield from self._ask("warnings")).message
+        match = _FLAGS.fullmatch(reply.data)
+        flags = tuple(match[2].split()) if match else ()
+        if match is None or int(match[1]) != len(flags):
+            raise DeviceRefused(self._label, f"the stage answered {reply.data!r} to 'warnings', which is no list")
+        self._see_flags(flags)
+
+    def _see_flags(self, flags: tuple[str, ...]) -> None:
+        had_reference = self._referenced
+        self._flags = flags
+        self._referenced = not UNREFERENCED.intersection(flags)
+        if had_reference and not self._referenced and not self._homing:
+            self._reference_lost = True
+        self._faults_told.intersection_update(flags)
+
+    def _judge(self) -> None:
+        """Raise what the operator must know, once."""
+        if self._reference_lost:
+            self._reference_lost = False
+            raise DeviceRefused(
+                self._label,
+                f"the stage has lost its reference position ({_in_words(self._flags)}); positions since then are wrong",
+                "It has probably restarted: check its power, then home it again.",
+            )
+        if self._homing and not self._busy:
+            self._homing = False
+            if not self._referenced:
+                raise DeviceRefused(
+                    self._label,
+                    f"homing ended without a reference position ({_in_words(self._flags)})",
+                    "Check that the carriage is free, then home it again.",
+                )
+        faults = [flag for flag in self._flags if flag.startswith("F") and flag not in self._faults_told]
+        if faults:
+            self._faults_told.update(faults)
+            raise DeviceRefused(
+                self._label,
+                f"the stage reports {_in_words(faults)}",
+                "Remove the cause; if the flag stays, power-cycle the stage.",
+            )
+
+    def _require_ready(self) -> None:
+        if not self._ready:
+            raise DeviceRefused(self._label, "the stage is not set up yet", "Poll it until it is ready.")
+
+    def _require_reference(self) -> None:
+        self._require_ready()
+        if not self._referenced:
+            raise DeviceRefused(
+                self._label, f"the stage has no reference position ({_in_words(self._flags)})", "Home it first."
+            )
+
+    def _speed_data(self, speed: float) -> int:
+        return round(speed / self._step * VELOCITY_UNIT)
+
+
+def _in_words(flags: Sequence[str]) -> str:
+    return ", ".join(f"{flag}: {WARNINGS.get(flag, 'unknown flag')}" for flag in flags)

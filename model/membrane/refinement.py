@@ -1,0 +1,281 @@
+"""Newton on a ladder of resolutions: the answer, and an estimate of its error from one rung to the next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.material.ogden import Array
+from model.membrane import ritz
+from model.membrane.output import Derivatives, Extremes, derivatives, extremes
+from model.membrane.ritz import Grid, Problem, State
+
+MOST_MODES = 64
+FIRST_MODES = 36  # the most to begin with
+MOST_STEPS = 25
+# Newton's step leaves an error of about the square of its relative size; a rung's change of the force is the error of
+# the rung below it, some times the error of the rung itself. Both factors are held to the truth by tests.
+NEWTON_FACTOR = 0.3
+RUNG_FACTOR = 0.5
+ROUND_OFF = 1e-13
+FOLDED = -1e-2  # of the meridional stress: a hoop stress below it will not turn out positive on a finer rung
+FLAT = -1e-9  # of the meridional stress: a hoop stress between it and zero is round-off
+LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two rungs may agree by chance
+
+
+@dataclass(slots=True)
+class Iterate:
+    """States after Newton at one resolution; a failed one has ``ok`` False."""
+
+    grid: Grid
+    state: State
+    lam: Array
+    change: Array  # largest relative change of a slope in the last step
+    tail: Array  # share of the energy that the last modes carry
+    stable: NDArray[np.bool_]
+    ok: NDArray[np.bool_]
+    steps: NDArray[np.intp]
+    hoop: Array | None = None  # least hoop over largest meridional stress at the points, before the last step
+
+    def put(self, index: NDArray[np.intp], other: Iterate) -> None:
+        """Take over other iterates of the states at ``index``."""
+        if other.grid.breaks is not self.grid.breaks:
+            breaks = self.grid.breaks.copy()
+            breaks[:, index] = other.grid.breaks
+            self.grid = Grid.lay(self.grid.table.modes, breaks)
+        self.state.put(index, other.state)
+        for name in ("lam", "change", "tail", "stable", "ok", "hoop"):
+            values = getattr(self, name)
+            if values is not None:
+                values[index] = getattr(other, name)
+        self.steps[index] += other.steps
+
+
+Settle = Callable[[Problem, Grid, State, float], Iterate]
+
+
+def first_modes(span: float, tolerance: float) -> int:
+    """Modes that bring the truncation error near ``tolerance`` for ``ln(b/a) = span``: a start, not a promise."""
+    return min(FIRST_MODES, max(2, math.ceil(-0.4 - math.log10(tolerance) * (0.25 + 0.12 * span))))
+
+
+def goal(tolerance: float) -> float:
+    """Change of a slope at which Newton's error is just below the tolerance."""
+    return min(0.03, max(1e-6, math.sqrt(0.9 * tolerance / NEWTON_FACTOR)))
+
+
+Number = TypeVar("Number", float, Array)
+
+
+def estimate(lam: Number, previous: Number, change: Number, tail: Number, tolerance: float) -> Number:
+    """Estimated relative error of ``lam``, after ``previous`` on the rung below; nan when there is none."""
+    rung = RUNG_FACTOR * abs((lam - previous) / lam)
+    return rung + NEWTON_FACTOR * change**2 + tail + (ROUND_OFF + LEAST_SHARE * tolerance)
+
+
+def next_modes(modes: int) -> int:
+    """The next rung."""
+    return min(MOST_MODES, modes + 2 if modes < 8 else math.ceil(1.35 * modes))
+
+
+def advance(state: State, step: ritz.Step, at: ritz.Points, grid: Grid) -> tuple[State, Array]:
+    """The state after a Newton step, shortened where a slope would change beyond reason; and the largest change.
+
+    Where the tension is a small rest of elastic and Maxwell stress, the force feels the change that much more.
+    """
+    w = state.w
+    change = np.abs(step.dw / w).max(axis=(0, 1), initial=0.0)
+    if at.law.maxwell is not None:
+        change *= np.sqrt(np.abs(at.law.maxwell / at.law.t1).max(axis=(0, 1), initial=1.0))
+    short: Array | float = 1.0
+    if not change.max() <= 0.8:
+        short = np.where(change > 2.0, 2.0 / change, 1.0)
+        moved = w + short * step.dw
+        moved = np.where(moved > 0.2 * w, moved, 0.2 * w)
+        c = state.c + short * step.dc
+    else:
+        moved = w + step.dw
+        c = state.c + step.dc
+    natural = state.natural
+    relief = at.law.relief
+    if natural is not None and relief is not None:
+        _, dq = grid.strain(step.dc)
+        natural = natural + relief.change + relief.rate * short * (at.along * dq + at.down * step.dw)
+    return State(c, moved, natural, state.relaxed), change
+
+
+def tail(problem: Problem, grid: Grid, state: State, step: ritz.Step) -> Array:
+    """Energy of the last mode of every element and a tenth of that of the last but one, over ``F h``."""
+    modes, m = grid.table.modes, grid.elements
+    last = state.c[modes - 1 : m * modes : modes] ** 2 * step.diagonal[modes - 1 : m * modes : modes]
+    fore = state.c[modes - 2 : m * modes : modes] ** 2 * step.diagonal[modes - 2 : m * modes : modes]
+    energy: Array = (last + 0.1 * fore).sum(axis=0)
+    return 0.5 * energy / (step.lam * problem.height)
+
+
+def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int = MOST_STEPS) -> Iterate:
+    """Newton from ``state`` until the slopes change by less than ``goal`` (relative); the error is then its square."""
+    states = state.w.shape[2]
+    steps = np.zeros(states, dtype=np.intp)
+    n = 0
+    while True:
+        n += 1
+        at = ritz.evaluate(problem, grid, state)
+        step = ritz.newton(problem, grid, state, at)
+        state, change = advance(state, step, at, grid)
+        steps += 1
+        done = change <= goal
+        rest = np.flatnonzero(~done)
+        if len(rest) == 0 or n >= limit or (n >= 4 and len(rest) < 0.5 * states):
+            break
+    ends = tail(problem, grid, state, step)
+    hoop = at.law.t2.min(axis=(0, 1)) / at.law.t1.max(axis=(0, 1))
+    ok = done & step.stable & (step.lam > 0.0)
+    result = Iterate(grid, state, step.lam, change, ends, step.stable, ok, steps, hoop)
+    if 0 < len(rest) < states and n < limit:
+        result.put(rest, newton(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n))
+    return result
+
+
+@dataclass(slots=True)
+class Answer:
+    """What one rung of the ladder settles: which states, and everything about them."""
+
+    index: NDArray[np.intp]
+    grid: Grid
+    state: State
+    lam: Array
+    error: Array
+    steps: NDArray[np.intp]
+    extremes: Extremes
+    derivatives: Derivatives | None
+
+    def take(self, index: ritz.Index) -> Answer:
+        """The answers at ``index``."""
+        return Answer(
+            self.index[index],
+            self.grid.take(index),
+            self.state.take(index),
+            self.lam[index],
+            self.error[index],
+            self.steps[index],
+            self.extremes.take(index),
+            None if self.derivatives is None else self.derivatives.take(index),
+        )
+
+
+@dataclass(slots=True)
+class Start:
+    """Where to begin: a resolution, the elements, a state of it."""
+
+    grid: Grid
+    state: State
+
+    def take(self, index: ritz.Index) -> Start:
+        """The states at ``index``."""
+        return Start(self.grid.take(index), self.state.take(index))
+
+
+def refine(start: Start, problem: Problem, modes: int) -> Start:
+    """The same state with more modes."""
+    old = start.grid.table
+    grid = Grid.lay(modes, start.grid.breaks)
+    m = grid.elements
+    c, states = start.state.c, start.state.c.shape[1]
+    added = np.zeros((m, modes - old.modes, states))
+    bubbles = np.concatenate((c[: m * old.modes].reshape(m, old.modes, states), added), axis=1)
+    c = np.concatenate((bubbles.reshape(-1, states), c[m * old.modes :]))
+    carry = ritz.transfer(old.modes, modes)
+
+    def moved(values: Array) -> Array:
+        return (carry @ values.reshape(old.points, -1)).reshape(-1, m, states)
+
+    natural, relaxed = start.state.natural, start.state.relaxed
+    w = moved(start.state.w)
+    w = np.where(w > 0.0, w, start.state.w.min(axis=(0, 1)))
+    return Start(
+        grid,
+        State(
+            c,
+            w,
+            None if natural is None else moved(natural),
+            None if relaxed is None else np.broadcast_to(relaxed[:1], w.shape),
+        ),
+    )
+
+
+def climb(
+    problem: Problem,
+    tolerance: float,
+    start: Start,
+    *,
+    sensitivities: bool = False,
+    settle: Settle = newton,
+    folded: list[tuple[NDArray[np.intp], Start]] | None = None,
+) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
+    """Solve a block of states to ``tolerance`` (relative, force), each with the resolution that it needs.
+
+    A state whose hoop stress is clearly negative is given up at once where ``folded`` is there to take it. Returns the
+    answers, the states that have none, and the steps spent on every state.
+    """
+    index = np.arange(len(problem.span))
+    total = np.zeros(len(index), dtype=np.intp)
+    answers: list[Answer] = []
+    lost: list[NDArray[np.intp]] = []
+    aim = goal(tolerance)
+    previous: Array | None = None
+    while True:
+        result = settle(problem, start.grid, start.state, aim)
+        start = Start(result.grid, result.state)
+        total[index] += result.steps
+        lam, ok = result.lam, result.ok
+        if folded is not None and result.hoop is not None:
+            gone = (result.change <= aim) & (result.hoop <= FOLDED)
+            if gone.any():
+                folded.append((index[gone], start.take(gone)))
+            lost.append(index[~(ok | gone)])
+            ok &= ~gone
+        else:
+            lost.append(index[~ok])
+        modes = start.grid.table.modes
+        if previous is not None:
+            error = estimate(lam, previous, result.change, result.tail, tolerance)
+            settled = np.flatnonzero(ok & (error <= tolerance))
+            if len(settled):
+                part = (problem, start, lam)
+                if len(settled) < len(index):
+                    part = (problem.take(settled), start.take(settled), lam[settled])
+                answers.append(_answer(*part, sensitivities))
+                answers[-1].index = index[settled]
+                answers[-1].error = error[settled]
+                answers[-1].steps = total[index[settled]]
+            rest = np.flatnonzero(ok & ~(error <= tolerance))
+        else:
+            rest = np.flatnonzero(ok)
+        if modes >= MOST_MODES:
+            lost.append(index[rest])
+            break
+        if len(rest) == 0:
+            break
+        if len(rest) < len(index):
+            problem, index, start, lam = problem.take(rest), index[rest], start.take(rest), lam[rest]
+        previous = lam
+        start = refine(start, problem, next_modes(modes))
+    return answers, np.concatenate(lost), total
+
+
+def _answer(problem: Problem, start: Start, lam: Array, sensitivities: bool) -> Answer:
+    grid, state = start.grid, start.state
+    at = ritz.evaluate(problem, grid, state)
+    slopes = None
+    if sensitivities:
+        step = ritz.newton(problem, grid, state, at, tangent=True)
+        assert step.tangent is not None
+        slopes = derivatives(problem, grid, state, at, lam, step.tangent)
+    empty = np.empty(0, dtype=np.intp)
+    return Answer(empty, grid, state, lam, np.empty(0), empty, extremes(problem, grid, state, at, lam), slopes)

@@ -1,0 +1,640 @@
+"""Force, stresses and field of a conical film at a displacement and a voltage, with a status and an error estimate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.material.materials import EPSILON_0
+from model.material.ogden import Array, Evaluations, Film, stack, stress
+from model.membrane import continuation as trace
+from model.membrane import ritz, tension_field
+from model.membrane import scalar as single
+from model.membrane.profile import Profile, dense, profile
+from model.membrane.refinement import FLAT, Answer, Start, climb, first_modes
+from model.membrane.ritz import LONGEST, Grid, Problem, State
+from model.membrane.scalar_state import Film as OneFilm
+from model.membrane.scalar_state import Found, slack
+from model.specimen import Specimen
+
+Wrinkling = Literal["plain", "tension_field"]
+Solved = tuple[Problem, Grid, State, Array]  # states, and their force over its unit
+BLOCK = 1024  # states solved together: their arrays stay in the processor's cache
+# Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
+# followed from rest.
+SOFTENING = 0.35
+TRACE_MODES = 10
+WIDEST = 28.0  # ln(b/a) beyond which the film's R^2 has no place in double precision
+
+
+class Status(IntEnum):
+    """What kind of answer a state has. Only TAUT and WRINKLED carry a force; elsewhere it is NaN."""
+
+    TAUT = 0
+    WRINKLED = 1
+    SLACK = 2
+    UNSTABLE = 3
+    NOT_CONVERGED = 4
+    INVALID = 5
+
+    @property
+    def message(self) -> str:
+        """One sentence for the operator."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.TAUT: "The film is in tension everywhere.",
+    Status.WRINKLED: "Hoop tension is lost somewhere: the film wrinkles there; the plain equations do not describe it.",
+    Status.SLACK: "The voltage has taken all tension out of the film: it hangs slack and no membrane answer exists.",
+    Status.UNSTABLE: "No stable state on the branch that starts at 0 V: this is beyond pull-in.",
+    Status.NOT_CONVERGED: "The solver found no solution to the tolerance asked for.",
+    Status.INVALID: "The input does not describe a film: see the reason given.",
+}
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """Answers to an array of states; every array has the broadcast shape S of the inputs.
+
+    Where ``status`` is neither TAUT nor WRINKLED the numbers are NaN.
+
+    Attributes
+    ----------
+    force : F (N), positive when it pushes the disk to positive h
+    peak_field, peak_field_radius : largest true field (V/m) and the undeformed radius R where it stands (m)
+    min_hoop_stress, min_meridional_stress : smallest true stresses (Pa)
+    max_stretch : largest principal stretch in the film's plane
+    status : `Status` numbers
+    error_estimate : estimated relative error of the force
+    iterations : Newton iterations spent
+    modes : resolution reached
+    stable : the energy has a minimum here
+    field_exceeded, stretch_exceeded : above the material's stated limits (False where it states none)
+    dforce : derivatives of the force with respect to "h", "voltage", "disk_radius", "ring_radius", "thickness",
+        "prestretch", "eps_r" (shape S) and "mu", "alpha" (shape S + (terms,)); None unless asked for
+    evaluations : how many points of the material's law were computed
+    """
+
+    force: Array
+    peak_field: Array
+    peak_field_radius: Array
+    min_hoop_stress: Array
+    min_meridional_stress: Array
+    max_stretch: Array
+    status: NDArray[np.int8]
+    error_estimate: Array
+    iterations: NDArray[np.intp]
+    modes: NDArray[np.intp]
+    stable: NDArray[np.bool_]
+    field_exceeded: NDArray[np.bool_]
+    stretch_exceeded: NDArray[np.bool_]
+    dforce: dict[str, Array] | None = None
+    evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.force.shape
+
+    @property
+    def answered(self) -> NDArray[np.bool_]:
+        """Where there is a force."""
+        return self.status <= Status.WRINKLED
+
+    @property
+    def tension_margin(self) -> Array:
+        """The smaller of the two least stresses (Pa): negative when tension is lost."""
+        return np.minimum(self.min_hoop_stress, self.min_meridional_stress)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The answer to one state; the attributes are those of `Solutions`, as plain numbers."""
+
+    specimen: Specimen
+    h: float
+    voltage: float
+    force: float
+    peak_field: float
+    peak_field_radius: float
+    min_hoop_stress: float
+    min_meridional_stress: float
+    max_stretch: float
+    status: Status
+    error_estimate: float
+    iterations: int
+    modes: int
+    stable: bool
+    field_exceeded: bool
+    stretch_exceeded: bool
+    dforce: dict[str, Any] | None = None
+    evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
+    kept: Solved | None = field(default=None, repr=False, compare=False)
+    quick: Found | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def answered(self) -> bool:
+        """Whether there is a force."""
+        return self.status <= Status.WRINKLED
+
+    @property
+    def tension_margin(self) -> float:
+        """The smaller of the two least stresses (Pa): negative when tension is lost."""
+        return min(self.min_hoop_stress, self.min_meridional_stress)
+
+    def profile(self, points: int = 101) -> Profile:
+        """Shape, stretches, stresses and field from disk to ring, at ``points`` radii an element.
+
+        Raises
+        ------
+        ValueError : the state has no answer
+        """
+        inputs = _Inputs.gather(self.specimen, self.h, self.voltage)
+        solved = self._solved(inputs)
+        return inputs.profile(np.zeros(1, dtype=np.intp), solved, dense(solved[1], points)).of(0)
+
+    def capacitance(self) -> float:
+        r"""Capacitance of the deformed film (F) between electrodes that cover it.
+
+        The film keeps its volume: where its area has grown by :math:`\lambda_1\lambda_2` it is thinner by as much, so
+        that
+
+        .. math:: C = \varepsilon \int \frac{dA}{t}
+                  = \frac{\varepsilon}{T \lambda_p^2} \int_a^b 2 \pi R (\lambda_1 \lambda_2)^2 dR
+
+        Raises
+        ------
+        ValueError : the state has no answer
+        """
+        problem, grid, state, _ = self._solved(_Inputs.gather(self.specimen, self.h, self.voltage))
+        film, at = self.specimen, ritz.evaluate(problem, grid, state)
+        area = 2.0 * math.pi * film.ring_radius**2 * float((grid.twice * np.exp(-2.0 * at.log[2])).sum())
+        return film.material.permittivity / (film.thickness * film.prestretch**2) * area
+
+    def _solved(self, inputs: _Inputs) -> Solved:
+        """The state itself, in arrays. Raises ValueError when it has no answer."""
+        if self.quick is not None:
+            problem = _Block(inputs, np.zeros(1, dtype=np.intp), self.evaluations).problem
+            return problem, *self.quick.arrays(), np.array([self.quick.lam])
+        if self.kept is None:
+            raise ValueError(f"no profile: {self.status.message}")
+        return self.kept
+
+
+@dataclass
+class _Inputs:
+    """The broadcast inputs as flat arrays."""
+
+    shape: tuple[int, ...]
+    specimens: list[Specimen]
+    which: NDArray[np.intp]  # index of the specimen of each state
+    h: Array
+    voltage: Array
+
+    @classmethod
+    def gather(
+        cls, specimen: Specimen | Sequence[Specimen] | NDArray[np.object_], h: ArrayLike, v: ArrayLike
+    ) -> _Inputs:
+        h_array = np.asarray(h, dtype=float)
+        v_array = np.asarray(v, dtype=float)
+        if isinstance(specimen, Specimen):
+            specimens = [specimen]
+            index = np.zeros((), dtype=np.intp)
+        else:
+            grid = np.empty(len(specimen), dtype=object) if not isinstance(specimen, np.ndarray) else specimen
+            if not isinstance(specimen, np.ndarray):
+                grid[:] = list(specimen)
+            specimens = list(grid.ravel())
+            index = np.arange(len(specimens), dtype=np.intp).reshape(grid.shape)
+        which, hh, vv = np.broadcast_arrays(index, h_array, v_array)
+        return cls(hh.shape, specimens, which.ravel(), hh.ravel(), vv.ravel())
+
+    def profile(self, index: NDArray[np.intp], solved: Solved, x: Array) -> Profile:
+        """Profiles of the states at ``index`` at places ``x`` (points, S) of ``ln(R/b)``."""
+        films = [self.specimens[i] for i in self.which[index]]
+        found = profile(
+            *solved,
+            x,
+            ring=np.array([film.ring_radius for film in films]),
+            shear=np.array([film.material.shear_modulus for film in films]),
+            field=np.abs(self.voltage[index]) / [film.thickness for film in films],
+        )
+        sign = np.where(self.h[index] < 0.0, -1.0, 1.0)[:, None]
+        return replace(found, z=sign * found.z, slope=sign * found.slope)
+
+    def blocks(self) -> Iterator[NDArray[np.intp]]:
+        """States to solve together: with or without voltage, of like spans, and as many as stay in the cache."""
+        index = np.flatnonzero(np.isfinite(self.h) & np.isfinite(self.voltage))
+        charged = self.voltage[index] != 0.0
+        groups = [index] if charged.all() or not charged.any() else [index[~charged], index[charged]]
+        of_film = np.log([s.ring_radius / s.disk_radius for s in self.specimens])
+        for group in groups:
+            spans = of_film[self.which[group]]
+            if len(self.specimens) > 1:
+                order = np.argsort(spans, kind="stable")
+                group, spans = group[order], spans[order]
+            pieces = np.ceil(spans / LONGEST)
+            cuts = np.flatnonzero(np.diff(pieces)) + 1
+            for part in np.split(group, cuts):
+                for start in range(0, len(part), BLOCK):
+                    yield part[start : start + BLOCK]
+
+
+def _padded(materials: Sequence[tuple[float, ...]], fill: float) -> Array:
+    terms = max(map(len, materials))
+    if any(len(values) < terms for values in materials):
+        materials = [values + (fill,) * (terms - len(values)) for values in materials]
+    return np.array(materials).T
+
+
+def solve_many(
+    specimen: Specimen | Sequence[Specimen] | NDArray[np.object_],
+    h: ArrayLike,
+    voltage: ArrayLike = 0.0,
+    *,
+    tolerance: float = 1e-8,
+    wrinkling: Wrinkling = "plain",
+    sensitivities: bool = False,
+) -> Solutions:
+    """Solve many states at once.
+
+    Parameters
+    ----------
+    specimen : one film, or a sequence or object array of films, broadcast with the others
+    h, voltage : displacement of the disk (m) and voltage (V), broadcast to a shape S
+    tolerance : relative error of the force to aim for, 1e-12 to 1e-2
+    wrinkling : "plain", the paper's equations whatever the hoop stress; or "tension_field", the relaxed energy
+    sensitivities : also give ``dforce``
+
+    Returns
+    -------
+    Solutions of shape S. A state without an answer has a status that says so and NaN; it never raises.
+    """
+    return _solve(_Inputs.gather(specimen, h, voltage), tolerance, wrinkling, sensitivities)[0]
+
+
+def profiles(
+    specimen: Specimen | Sequence[Specimen] | NDArray[np.object_],
+    h: ArrayLike,
+    voltage: ArrayLike = 0.0,
+    points: int = 101,
+    *,
+    tolerance: float = 1e-4,
+    wrinkling: Wrinkling = "plain",
+) -> Profile:
+    """The profiles of many states at even steps of ln R, (states, points); NaN where there is no answer.
+
+    Parameters as in `solve_many`; the tolerance, of the force, is for drawing.
+    """
+    inputs = _Inputs.gather(specimen, h, voltage)
+    found = Profile.blank(len(inputs.h), points)
+    share = np.linspace(1.0, 0.0, points)[:, None]
+    with np.errstate(all="ignore"):
+        for index, solved in _solve(inputs, tolerance, wrinkling, False, keep=True)[1]:
+            found.put(index, inputs.profile(index, solved, -share * solved[0].span))
+    return found
+
+
+def _check(tolerance: float, wrinkling: str) -> None:
+    if not 1e-12 <= tolerance <= 1e-2:
+        raise ValueError(f"tolerance = {tolerance!r}: allowed are 1e-12 to 1e-2")
+    if wrinkling not in ("plain", "tension_field"):
+        raise ValueError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
+
+
+def _quick(
+    specimen: Specimen, h: float, voltage: float, tolerance: float, folds: bool, near: Found | None
+) -> Solution | None:
+    """An easy state, solved without arrays; None when it is not one."""
+    m, t, b, lp = specimen.material, specimen.thickness, specimen.ring_radius, specimen.prestretch
+    if h == 0.0 or not (math.isfinite(h) and math.isfinite(voltage)) or tolerance < 1e-11:
+        return None
+    shear = m.shear_modulus
+    film = OneFilm(
+        terms=tuple((mu / shear, alpha, mu / shear * alpha) for mu, alpha in zip(m.mu, m.alpha, strict=True)),
+        field=m.permittivity * (voltage / t) ** 2 / shear,
+        log_prestretch=math.log(lp),
+        span=math.log(b / specimen.disk_radius),
+        height=abs(h) / b,
+    )
+    count = Evaluations()
+    found = None if near is None else single.solve(film, tolerance, count, folds=folds, near=near)
+    if found is None:
+        found = single.solve(film, tolerance, count, folds=folds)
+    if found is None or found.softening > SOFTENING or found.meridional <= 0.0:
+        return None
+    wrinkled = bool(found.cones) or found.hoop < FLAT * found.meridional
+    if wrinkled and slack(film):
+        return None
+    force = 2.0 * math.pi * b * t * shear / lp**2 * found.lam
+    peak, stretch = abs(voltage) / t * math.exp(found.log_area), math.exp(found.log_stretch)
+    return Solution(
+        specimen=specimen,
+        h=h,
+        voltage=voltage,
+        force=math.copysign(force, h),
+        peak_field=peak,
+        peak_field_radius=b * found.radius,
+        min_hoop_stress=shear * found.hoop,
+        min_meridional_stress=shear * found.meridional,
+        max_stretch=stretch,
+        status=Status.WRINKLED if wrinkled else Status.TAUT,
+        error_estimate=found.error,
+        iterations=found.steps,
+        modes=found.modes,
+        stable=True,
+        field_exceeded=m.breakdown_field is not None and peak > m.breakdown_field,
+        stretch_exceeded=m.max_stretch is not None and stretch > m.max_stretch,
+        evaluations=count,
+        quick=found,
+    )
+
+
+def _solve(
+    inputs: _Inputs, tolerance: float, wrinkling: Wrinkling, sensitivities: bool, keep: bool = False
+) -> tuple[Solutions, list[tuple[NDArray[np.intp], Solved]]]:
+    """The solutions, and with ``keep`` the states themselves."""
+    _check(tolerance, wrinkling)
+    result = _Flat(len(inputs.h), max((len(s.material.mu) for s in inputs.specimens), default=1), sensitivities, keep)
+    count = Evaluations()
+    with np.errstate(all="ignore"):
+        for index in inputs.blocks():
+            _Block(inputs, index, count).solve(result, tolerance, wrinkling, sensitivities)
+    return result.solutions(inputs.shape, count), result.kept
+
+
+def solve(
+    specimen: Specimen,
+    h: float,
+    voltage: float = 0.0,
+    *,
+    tolerance: float = 1e-8,
+    wrinkling: Wrinkling = "plain",
+    sensitivities: bool = False,
+    near: Solution | None = None,
+) -> Solution:
+    """Solve one state: `solve_many` for scalars, with the profiles at hand.
+
+    ``near``, the solution of a like state, shortens the way to a taut one; the answer does not depend on it.
+    """
+    _check(tolerance, wrinkling)
+    if not sensitivities:
+        folds = wrinkling == "tension_field"
+        quick = _quick(specimen, float(h), float(voltage), tolerance, folds, near.quick if near else None)
+        if quick is not None:
+            return quick
+    inputs = _Inputs.gather(specimen, float(h), float(voltage))
+    many, kept = _solve(inputs, tolerance, wrinkling, sensitivities, keep=True)
+    return Solution(
+        specimen=specimen,
+        h=float(h),
+        voltage=float(voltage),
+        force=float(many.force),
+        peak_field=float(many.peak_field),
+        peak_field_radius=float(many.peak_field_radius),
+        min_hoop_stress=float(many.min_hoop_stress),
+        min_meridional_stress=float(many.min_meridional_stress),
+        max_stretch=float(many.max_stretch),
+        status=Status(int(many.status)),
+        error_estimate=float(many.error_estimate),
+        iterations=int(many.iterations),
+        modes=int(many.modes),
+        stable=bool(many.stable),
+        field_exceeded=bool(many.field_exceeded),
+        stretch_exceeded=bool(many.stretch_exceeded),
+        dforce=None
+        if many.dforce is None
+        else {k: v if k in ("mu", "alpha") else float(v) for k, v in many.dforce.items()},
+        evaluations=many.evaluations,
+        kept=kept[0][1] if kept else None,
+    )
+
+
+class _Flat:
+    """The results while they are being filled, one entry a state."""
+
+    def __init__(self, states: int, terms: int, sensitivities: bool, keep: bool) -> None:
+        self.real = {
+            name: np.full(states, np.nan)
+            for name in (
+                "force",
+                "peak_field",
+                "peak_field_radius",
+                "min_hoop_stress",
+                "min_meridional_stress",
+                "max_stretch",
+                "error_estimate",
+            )
+        }
+        self.whole = {name: np.zeros(states, dtype=np.intp) for name in ("iterations", "modes")}
+        self.flag = {
+            name: np.zeros(states, dtype=np.bool_) for name in ("stable", "field_exceeded", "stretch_exceeded")
+        }
+        self.status = np.full(states, Status.INVALID, dtype=np.int8)
+        self.dforce: dict[str, Array] | None = None
+        self.keep = keep
+        self.kept: list[tuple[NDArray[np.intp], Solved]] = []
+        if sensitivities:
+            names = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
+            self.dforce = {name: np.full(states, np.nan) for name in names}
+            self.dforce |= {name: np.full((states, terms), np.nan) for name in ("mu", "alpha")}
+
+    def solutions(self, shape: tuple[int, ...], count: Evaluations) -> Solutions:
+        dforce = None
+        if self.dforce is not None:
+            dforce = {name: values.reshape(shape + values.shape[1:]) for name, values in self.dforce.items()}
+        return Solutions(
+            **{name: values.reshape(shape) for name, values in (self.real | self.whole | self.flag).items()},
+            status=self.status.reshape(shape),
+            dforce=dforce,
+            evaluations=count,
+        )
+
+
+class _Block:
+    """Some of the states, in dimensionless form, and the way back to SI."""
+
+    def __init__(self, inputs: _Inputs, index: NDArray[np.intp], count: Evaluations) -> None:
+        self.index = index
+        self.h, self.voltage = inputs.h[index], inputs.voltage[index]
+        used, pick = np.unique(inputs.which[index], return_inverse=True)
+        films = [inputs.specimens[i] for i in used.tolist()]
+        materials = [s.material for s in films]
+        self.terms = np.array([len(m.mu) for m in materials], dtype=np.intp)[pick]
+        numbers = np.array(
+            [
+                (
+                    s.disk_radius,
+                    s.ring_radius,
+                    s.thickness,
+                    s.prestretch,
+                    m.shear_modulus,
+                    m.eps_r,
+                    m.breakdown_field or math.inf,
+                    m.max_stretch or math.inf,
+                )
+                for s, m in zip(films, materials, strict=True)
+            ]
+        ).reshape(len(films), 8)[pick]
+        self.a, self.b, self.t, self.lp, self.shear, self.eps_r, self.strength, self.elongation = numbers.T
+        mu = _padded([m.mu for m in materials], 0.0)
+        alpha = _padded([m.alpha for m in materials], 1.0)
+        if len(films) > 1:
+            mu, alpha = mu[:, pick], alpha[:, pick]
+        charged = bool(np.any(self.voltage))
+        film = Film(
+            mu=mu / (self.shear if len(films) > 1 else self.shear[:1]),
+            alpha=alpha,
+            field=EPSILON_0 * self.eps_r * (self.voltage / self.t) ** 2 / self.shear if charged else None,
+            count=count,
+        )
+        # The flat film is the limit of a vanishing height: solve there, then give zero force.
+        height = np.where(self.h == 0.0, 1e-9, np.abs(self.h) / self.b)
+        self.problem = Problem(film, np.log(self.lp), np.log(self.b / self.a), height)
+
+    def solve(self, result: _Flat, tolerance: float, wrinkling: Wrinkling, sensitivities: bool) -> None:
+        """Solve the block and write what comes out."""
+        index, problem = np.arange(len(self.index)), self.problem
+        if problem.span.max() > WIDEST:
+            result.status[self.index] = Status.NOT_CONVERGED
+            return
+        if problem.film.field is not None:
+            slack = self.slack()
+            if slack.any():
+                result.status[self.index[slack]] = Status.SLACK
+                index = np.flatnonzero(~slack)
+                if len(index) == 0:
+                    return
+                problem = problem.take(index)
+        relaxed = wrinkling == "tension_field"
+        breaks = problem.cut()
+        grid = Grid.lay(first_modes(float(problem.span.max()) / (len(breaks) - 1), tolerance), breaks)
+        start = Start(grid, ritz.guess(problem, grid))
+        folded: list[tuple[NDArray[np.intp], Start]] = []
+        answers, lost, steps = climb(
+            problem, tolerance, start, sensitivities=sensitivities, folded=folded if relaxed else None
+        )
+        doubtful = [] if relaxed else [lost]
+        for answer in answers:
+            x = answer.extremes
+            soft = x.softening > SOFTENING
+            wrinkled = x.hoop < FLAT * x.meridional if relaxed else np.zeros_like(soft)
+            doubtful.append(answer.index[soft & ~wrinkled])
+            if wrinkled.any():
+                folded.append((answer.index[wrinkled], Start(answer.grid, answer.state).take(wrinkled)))
+            self.place(result, index, answer, ~(soft | wrinkled))
+        if relaxed:
+
+            def relax(some: NDArray[np.intp], begin: Start | None) -> NDArray[np.intp]:
+                answers, lost, spent = tension_field.solve(
+                    problem.take(some), tolerance, sensitivities=sensitivities, begin=begin
+                )
+                steps[some] += spent
+                for answer in answers:
+                    soft = answer.extremes.softening > SOFTENING
+                    answer.index = some[answer.index]
+                    doubtful.append(answer.index[soft])
+                    self.place(result, index, answer, ~soft)
+                return some[lost]
+
+            # Folds begin where the plain equations put them; what this does not settle begins with a search.
+            some = np.concatenate([lost, *(relax(*begun) for begun in folded)])
+            doubtful.append(relax(some, None) if len(some) else some)
+        some = np.concatenate(doubtful)
+        if len(some):
+            self.follow(result, index, problem, some, steps, tolerance, relaxed, sensitivities)
+        result.whole["iterations"][self.index[index]] = steps
+
+    def follow(
+        self,
+        result: _Flat,
+        index: NDArray[np.intp],
+        problem: Problem,
+        some: NDArray[np.intp],
+        steps: NDArray[np.intp],
+        tolerance: float,
+        relaxed: bool,
+        sensitivities: bool,
+    ) -> None:
+        """Solve states for which a cold start may have missed, or jumped from, the branch that starts at rest."""
+        part = problem.take(some)
+        path = trace.follow(part, TRACE_MODES, relaxed=relaxed)
+        steps[some] += path.steps
+        status = np.where(path.limit, Status.UNSTABLE, Status.NOT_CONVERGED)
+        result.status[self.index[index[some]]] = status
+        good = np.flatnonzero(path.reached)
+        if len(good) == 0:
+            return
+        here, grid, state = part.take(good), path.grid.take(good), path.state.take(good)
+        if relaxed:
+            answers, _, spent = tension_field.solve(
+                here, tolerance, sensitivities=sensitivities, begin=Start(grid, state)
+            )
+        else:
+            answers, _, spent = climb(here, tolerance, Start(grid, state), sensitivities=sensitivities)
+        steps[some[good]] += spent
+        for answer in answers:
+            answer.index = some[good[answer.index]]
+            self.place(result, index, answer, np.ones(len(answer.index), dtype=np.bool_))
+
+    def slack(self) -> NDArray[np.bool_]:
+        """Where the film, stretched like a straight cone, would push outwards: no tension can hold it."""
+        p = self.problem
+        cone = p.height / -np.expm1(-p.span)
+        log = p.log_prestretch + 0.5 * np.log1p(cone * cone)
+        tension: Array = stress(p.film, stack(log, log)).t1
+        return tension < 0.0
+
+    def place(self, result: _Flat, index: NDArray[np.intp], answer: Answer, these: NDArray[np.bool_]) -> None:
+        """Write ``these`` of an answer's states in SI units; ``index``: the answer's numbers to the block's."""
+        if not these.all():
+            if not these.any():
+                return
+            answer = answer.take(these)
+        where = index[answer.index]
+        to = self.index[where]
+        if result.keep:
+            result.kept.append((to, (self.problem.take(where), answer.grid, answer.state, answer.lam)))
+        h, v, t, shear, lp, b = (x[where] for x in (self.h, self.voltage, self.t, self.shear, self.lp, self.b))
+        sign = np.sign(h)
+        scale = 2.0 * np.pi * b * t * shear / lp**2
+        force = scale * answer.lam * sign
+        x = answer.extremes
+        result.real["force"][to] = force
+        result.real["peak_field"][to] = np.abs(v) / t * np.exp(x.log_area)
+        result.real["peak_field_radius"][to] = x.radius * b
+        result.real["min_hoop_stress"][to] = shear * x.hoop
+        result.real["min_meridional_stress"][to] = shear * x.meridional
+        result.real["max_stretch"][to] = np.exp(x.log_stretch)
+        result.real["error_estimate"][to] = answer.error
+        result.whole["modes"][to] = answer.grid.table.modes
+        result.flag["stable"][to] = True
+        result.flag["field_exceeded"][to] = result.real["peak_field"][to] > self.strength[where]
+        result.flag["stretch_exceeded"][to] = result.real["max_stretch"][to] > self.elongation[where]
+        folded = x.hoop < FLAT * x.meridional
+        if answer.state.relaxed is not None:
+            folded |= answer.state.relaxed.any(axis=(0, 1))
+        result.status[to] = np.where(folded, Status.WRINKLED, Status.TAUT)
+        d = answer.derivatives
+        if d is None or result.dforce is None:
+            return
+        f = result.dforce
+        scale = scale * sign
+        slope = 2.0 * np.pi * t * shear / lp**2 * d.height
+        f["h"][to] = slope
+        f["prestretch"][to] = (scale * d.log_prestretch - 2.0 * force) / lp
+        f["eps_r"][to] = scale * d.log_field / self.eps_r[where]
+        f["voltage"][to] = np.where(v != 0.0, 2.0 * scale * d.log_field / np.where(v != 0.0, v, 1.0), 0.0)
+        f["thickness"][to] = (force - 2.0 * scale * d.log_field) / t
+        f["disk_radius"][to] = -scale * d.span / self.a[where]
+        f["ring_radius"][to] = (force - h * slope + scale * d.span) / b
+        absent = np.arange(d.mu.shape[0])[:, None] >= self.terms[where]
+        terms = d.mu.shape[0]
+        f["mu"][to, :terms] = np.where(absent, np.nan, scale / shear * d.mu).T
+        f["alpha"][to, :terms] = np.where(absent, np.nan, scale * d.alpha).T

@@ -1,0 +1,340 @@
+r"""Wrinkled films: the relaxed energy, with a cut in the elements at every edge of a wrinkled zone.
+
+Where the plain equations give a hoop stress below zero the film folds instead, and only its natural width
+``l2*(l1)``, with ``sigma2(l1, l2*) = 0``, makes stress. The relaxed energy ``min over l2 of W*`` then carries no hoop
+stress and the stiffness ``W11 - W12^2/W22``; the meridian of a wrinkled zone is straight. The solution has a kink at
+the zone's edge, so the elements are cut there: each is wrinkled or taut as a whole and smooth, and the cut moves with
+Newton's steps to where the hoop stress of the taut side vanishes. A misplaced cut errs in the force by the third power
+of its distance only, and each step leaves a distance of the square of the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.material.ogden import Array, stack, stress
+from model.membrane import refinement as ladder
+from model.membrane import ritz
+from model.membrane.output import FINE, fine_table
+from model.membrane.refinement import Answer, Iterate, Start
+from model.membrane.ritz import Grid, Points, Problem, State
+from model.membrane.wrinkled_cone import Cones, Springs, natural_width, whole
+
+START_MODES = 5
+MOST_ZONES = 5
+ROUNDS = 4
+SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a wrong sign, as it has beside a cut
+CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
+
+
+def guess(problem: Problem, grid: Grid) -> State:
+    """A first state like that of `ritz.guess`, with the relaxed law where a straight cone would wrinkle."""
+    mean = problem.height / -np.expm1(-problem.span)
+    square = mean * mean
+    log1 = 0.5 * np.log1p(square) + problem.log_prestretch
+    plain = stress(problem.film, stack(log1, problem.log_prestretch))
+    natural, law = natural_width(problem, log1, problem.log_prestretch - 0.0 * log1, 1e-6)
+    folded = plain.t2 < 0.0
+    t1, h11 = np.where(folded, law.t1, plain.t1), np.where(folded, law.h11, plain.h11)
+    part = square / (1.0 + square)
+    power = np.where(t1 > 0.0, 1.0 - 2.0 * part + part * h11 / t1, np.inf)
+    power = np.where(power > 0.5, power, 1.0)
+    w = np.exp(np.log(grid.radius) / -power)
+    w *= problem.height / (grid.once * w).sum(axis=(0, 1))
+    hoop = np.where(folded, natural, problem.log_prestretch) + 0.0 * w
+    return State(np.zeros((grid.unknowns, w.shape[2])), w, hoop, np.broadcast_to(folded, w.shape))
+
+
+def search(problem: Problem, grid: Grid, state: State, goal: float = 2e-2, limit: int = 30) -> Iterate:
+    """Newton with every point taut or wrinkled by itself: no order of convergence, but it finds the zones."""
+    states = state.w.shape[2]
+    steps = np.zeros(states, dtype=np.intp)
+    n = 0
+    while True:
+        n += 1
+        at = ritz.evaluate(problem, grid, state)
+        step = ritz.newton(problem, grid, state, at)
+        new, change = ladder.advance(state, step, at, grid)
+        assert state.relaxed is not None and state.natural is not None and new.natural is not None
+        assert at.law.relief is not None
+        # A folded point stays folded while its circle is narrower than its natural width.
+        folded = np.where(state.relaxed, at.hoop < state.natural + at.law.relief.change, at.law.t2 < 0.0)
+        flips = (folded != state.relaxed).any(axis=(0, 1))
+        state = State(new.c, new.w, np.where(folded & state.relaxed, new.natural, at.hoop), folded)
+        steps += 1
+        quiet = (change <= goal) & ~flips
+        if quiet.all() or n >= limit:
+            break
+        if n >= 5 and states > 1 and quiet.mean() > 0.5:
+            rest = np.flatnonzero(~quiet)
+            more = search(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n)
+            state.put(rest, more.state)
+            lam, stable = step.lam, step.stable
+            lam[rest], change[rest], stable[rest] = more.lam, more.change, more.stable
+            quiet[rest] = more.ok
+            steps[rest] += more.steps
+            return Iterate(grid, state, lam, change, np.zeros(states), stable, quiet & stable & (lam > 0.0), steps)
+    stable = step.stable & at.law.relief.regular.all(axis=(0, 1))
+    return Iterate(grid, state, step.lam, change, np.zeros(states), stable, quiet & stable & (step.lam > 0.0), steps)
+
+
+@dataclass(slots=True)
+class Zones:
+    """Where the sign of the hoop tension changes."""
+
+    changes: NDArray[np.intp]  # (S,)
+    first: NDArray[np.bool_]  # (S,): wrinkled at the disk
+    where: Array  # (MOST_ZONES - 1, S): ln(R/b) of the changes, in order
+
+
+def zones(grid: Grid, state: State, at: Points, slack: float = 0.0) -> Zones:
+    """Zones of a state, by the hoop stress where taut and by the slack in the width where wrinkled.
+
+    A sign against the element's own kind counts only beyond ``slack`` times the largest value: with cuts in place their
+    vicinity is round-off.
+    """
+    tension = at.law.t2 if state.relaxed is None else np.where(state.relaxed, at.hoop - at.log[1], at.law.t2)
+    points, m, states = tension.shape
+    whole = state.relaxed is None or bool((state.relaxed == state.relaxed[:1]).all())
+    if whole:
+        fine = fine_table(grid.table.modes) @ tension.reshape(points, m * states)
+        fine = fine.reshape(FINE, m, states).swapaxes(0, 1).reshape(m * FINE, states)
+        share = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, FINE)))
+    else:  # each point decides for itself: no polynomial passes through them
+        fine = tension.swapaxes(0, 1).reshape(m * points, states)
+        share = 0.5 * (1.0 + grid.table.xi)
+    folded = fine < 0.0
+    if slack > 0.0 and whole and state.relaxed is not None:
+        kind = np.repeat(state.relaxed[0], FINE, axis=0)
+        bound = slack * np.maximum(fine.max(axis=0), -fine.min(axis=0))
+        folded = np.where(kind, fine < bound, fine < -bound)
+    flips = folded[1:] != folded[:-1]
+    changes = flips.sum(axis=0)
+    where = np.full((MOST_ZONES - 1, states), np.nan)
+    columns, rows = np.nonzero(flips.T)
+    rank = np.arange(len(columns)) - (np.cumsum(changes) - changes)[columns]
+    few = rank < MOST_ZONES - 1
+    columns, rows, rank = columns[few], rows[few], rank[few]
+    low, high = fine[rows, columns], fine[rows + 1, columns]
+    part = np.clip(low / (low - high), 0.05, 0.95)
+    part = np.where(np.isfinite(part), part, 0.5)
+    element, place = np.divmod(np.stack((rows, rows + 1)), len(share))
+    left, right = grid.breaks[element, columns], grid.breaks[element + 1, columns]
+    x = left + share[place] * (right - left)
+    where[rank, columns] = x[0] + part * (x[1] - x[0])
+    return Zones(changes, folded[0], where)
+
+
+def remap(old: Grid, state: State, natural: Array, breaks: Array, modes: int, wrinkled: NDArray[np.bool_]) -> Start:
+    """A ``state`` of ``old`` carried to other elements, of which those ``wrinkled`` (M,) are relaxed.
+
+    ``natural`` is ``ln(l2)`` at the points of ``old`` to begin with where there are folds.
+    """
+    grid = Grid.lay(modes, breaks)
+    t, states = grid.table, breaks.shape[1]
+    x = 0.5 * (t.xi[:, None, None] + 1.0) * (breaks[1:] - breaks[:-1]) + breaks[:-1]
+
+    def carry(x: Array) -> Callable[[Array], Array]:
+        """Takes point values (Q, M, S) of the old elements, as polynomials, to ``x`` (..., S)."""
+        inner = old.breaks[1:-1].reshape(-1, *(1,) * (x.ndim - 1), states)
+        element, columns = (x > inner).sum(axis=0), np.arange(states)
+        left, right = old.breaks[element, columns], old.breaks[element + 1, columns]
+        xi = np.clip(2.0 * (x - left) / (right - left) - 1.0, -1.0, 1.0)
+
+        def at(values: Array) -> Array:
+            c = (old.table.to_legendre @ values.reshape(len(values), -1)).reshape(values.shape)
+            return np.asarray(np.polynomial.legendre.legval(xi, c[:, element, columns], tensor=False))
+
+        return at
+
+    to_points, to_cuts = carry(x), carry(breaks[1:-1])
+    e, q = old.strain(state.c)
+    bubbles = np.tensordot(t.to_modes, to_points(q - e) / grid.dxi, 1).swapaxes(0, 1)
+    c = np.concatenate((bubbles.reshape(-1, states), to_cuts(e)))
+    w = np.maximum(to_points(state.w), state.w.min(axis=(0, 1)))
+    return Start(grid, State(c, w, to_points(natural), np.broadcast_to(wrinkled[:, None], w.shape)))
+
+
+def settle(problem: Problem, grid: Grid, state: State, goal: float, limit: int = 15) -> Iterate:
+    """Newton on the state together with the cuts, every wrinkled element a cone."""
+    assert state.relaxed is not None
+    kinds = state.relaxed[0, :, 0].tolist()
+    folded = tuple(k for k, kind in enumerate(kinds) if kind)
+    taut = tuple(k for k, kind in enumerate(kinds) if not kind)
+    modes, m = grid.table.modes, grid.elements
+    own = np.concatenate([np.arange(k * modes, (k + 1) * modes) for k in taut] + [np.arange(m * modes, grid.unknowns)])
+    film = State(state.c[own.astype(np.intp)], state.w[:, list(taut)])
+    cones = Cones.of(problem, grid, state, folded)
+    return _settle(problem, grid, film, taut, cones, goal, limit)
+
+
+def _settle(
+    problem: Problem, grid: Grid, film: State, taut: tuple[int, ...], cones: Cones, goal: float, limit: int
+) -> Iterate:
+    states = film.w.shape[2]
+    steps = np.zeros(states, dtype=np.intp)
+    while True:
+        steps += 1
+        panels = grid.part(taut)
+        at = ritz.evaluate(problem, panels, film)
+        system = ritz.reduce(panels, film.w, at)
+        springs = Springs.of(problem, grid, panels, cones, film.c)
+        springs.join(system)
+        step = ritz.solve(problem, panels, system)
+        new, change = ladder.advance(film, step, at, panels)
+        cones, bent = springs.advance(step.dc, step.lam)
+        # A cut that moves carries the strains with it: they must have settled as well as the slopes.
+        de, dq = panels.strain(step.dc)
+        size = (np.abs(at.q) + film.w**2).max(axis=(0, 1), initial=1e-300)
+        change = np.maximum(np.maximum(change, bent), np.abs(dq).max(axis=(0, 1), initial=0.0) / size)
+        tension = at.law.t2 + at.law.h12 * (at.along * dq + at.down * step.dw) + at.law.h22 * at.around * de
+        breaks, shift = _moved(grid, panels, taut, cones.which, tension)
+        change = np.maximum(change, CUT_WEIGHT * shift)
+        # Where it has settled the state belongs to the cuts as they were.
+        grid = Grid.lay(grid.table.modes, np.where(change <= goal, grid.breaks, breaks))
+        film = new
+        done = change <= goal
+        stable = step.stable & springs.regular
+        rest = np.flatnonzero(~done)
+        if len(rest) == 0 or int(steps[0]) >= limit or len(rest) <= 0.5 * states:
+            break
+    ends = ladder.tail(problem, panels, film, step)
+    state = whole(grid, film, taut, cones)
+    result = Iterate(grid, state, step.lam, change, ends, stable, done & stable & (step.lam > 0.0), steps)
+    if len(rest) > 0 and int(steps[0]) < limit:
+        some = (problem.take(rest), grid.take(rest), film.take(rest), taut, cones.take(rest))
+        result.put(rest, _settle(*some, goal, limit - int(steps[0])))
+    return result
+
+
+def _moved(
+    grid: Grid, panels: Grid, taut: tuple[int, ...], folded: tuple[int, ...], tension: Array
+) -> tuple[Array, Array]:
+    """Breaks moved to where the hoop ``tension`` of the panels vanishes, and the largest shift over an element."""
+    t, breaks = grid.table, grid.breaks.copy()
+    length = breaks[1:] - breaks[:-1]
+    largest = np.zeros(breaks.shape[1])
+    for panel, element in enumerate(taut):
+        for end, side in ((0, 1.0), (1, -1.0)):
+            beside = element - int(side)
+            if beside not in folded:
+                continue
+            value = t.ends[end] @ tension[:, panel]
+            slope = (t.end_slopes[end] @ tension[:, panel]) * panels.dxi[panel] * side
+            # Towards the taut zone where it is not taut, away from it where it pulls at the cut.
+            shift = -value / slope * side
+            shift = np.where(slope > 0.0, shift, -0.2 * np.sign(value) * side * length[element])
+            cut = max(element, beside)
+            shift = np.clip(np.nan_to_num(shift), -0.5 * length[cut - 1], 0.5 * length[cut])
+            breaks[cut] += shift
+            largest = np.maximum(largest, np.abs(shift) / np.minimum(length[element], length[beside]))
+    breaks[1:-1] = np.clip(breaks[1:-1], breaks[:-2], breaks[2:])
+    return breaks, largest
+
+
+def _cut(film: Problem, edges: Array, first: bool) -> tuple[Array, NDArray[np.bool_]]:
+    """Breaks at the zones' ``edges`` and inside zones that are too long, and which elements are wrinkled."""
+    ends = np.concatenate((-film.span[None], edges, np.zeros((1, len(film.span)))))
+    breaks, wrinkled = [ends[:1]], []
+    for number, (left, right) in enumerate(pairwise(ends)):
+        pieces = ritz.elements(right - left)
+        breaks.append(left + (right - left) * np.linspace(0.0, 1.0, pieces + 1)[1:, None])
+        wrinkled += [(number % 2 == 0) == first] * pieces
+    return np.concatenate(breaks), np.array(wrinkled)
+
+
+def admissible(grid: Grid, state: State) -> NDArray[np.bool_]:
+    """Whether every cut still separates two elements."""
+    length = grid.breaks[1:] - grid.breaks[:-1]
+    good: NDArray[np.bool_] = (length > 1e-9 * (grid.breaks[-1] - grid.breaks[0])).all(axis=0)
+    return good
+
+
+def solve(
+    problem: Problem, tolerance: float, *, sensitivities: bool, begin: Start | None = None
+) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
+    """Solve states of which some part is wrinkled. Returns what `ladder.climb` does.
+
+    ``begin`` is a state of the plain equations, or one with every point taut or wrinkled by itself; found by `search`
+    when not given.
+    """
+    index = np.arange(len(problem.span))
+    steps = np.zeros(len(index), dtype=np.intp)
+    answers: list[Answer] = []
+    lost = [index[:0]]
+    if begin is None:
+        grid = Grid.lay(START_MODES, problem.cut())
+        found = search(problem, grid, guess(problem, grid))
+        steps += found.steps
+        begin = Start(grid, found.state)
+        lost.append(index[~found.ok])
+        index = index[found.ok]
+        begin = begin.take(found.ok)
+    pending = [(index, begin)]
+    for _ in range(ROUNDS):
+        queue, pending = pending, []
+        for some, begun in queue:
+            if len(some):
+                _round(problem, tolerance, sensitivities, some, begun, steps, answers, lost, pending)
+    lost.extend(some for some, _ in pending)
+    return answers, np.concatenate(lost), steps
+
+
+def _round(
+    problem: Problem,
+    tolerance: float,
+    sensitivities: bool,
+    index: NDArray[np.intp],
+    start: Start,
+    steps: NDArray[np.intp],
+    answers: list[Answer],
+    lost: list[NDArray[np.intp]],
+    again: list[tuple[NDArray[np.intp], Start]],
+) -> None:
+    """Cut the elements where the zones of ``start`` end, and solve; other zones than before: once more (``again``)."""
+    here = problem.take(index)
+    state = start.state
+    mixed: NDArray[np.bool_] = np.zeros(len(index), dtype=np.bool_)
+    if state.relaxed is not None:
+        mixed = np.asarray((state.relaxed.any(axis=0) & ~state.relaxed.all(axis=0)).any(axis=0))
+    for kind in (False, True):
+        some = np.flatnonzero(mixed == kind)
+        if len(some) == 0:
+            continue
+        part, grid, chosen = here.take(some), start.grid.take(some), state.take(some)
+        at = ritz.evaluate(part, grid, chosen)
+        zone = zones(grid, chosen, at)
+        pattern = 2 * zone.changes + zone.first
+        for number in np.unique(pattern).tolist():
+            changes, first = number // 2, bool(number % 2)
+            of = np.flatnonzero(pattern == number)
+            if changes >= MOST_ZONES:
+                lost.append(index[some[of]])
+                continue
+            film = part.take(of)
+            breaks, wrinkled = _cut(film, zone.where[:changes, of], first)
+            modes = max(3, ladder.first_modes(float((breaks[1:] - breaks[:-1]).max()), tolerance))
+            begun = remap(grid.take(of), chosen.take(of), at.log[1][..., of], breaks, modes, wrinkled)
+            done, missed, spent = ladder.climb(film, tolerance, begun, sensitivities=sensitivities, settle=settle)
+            where = index[some[of]]
+            lost.append(where[missed])
+            steps[where] += spent
+            for answer in done:
+                solved = film.take(answer.index)
+                now = zones(
+                    answer.grid,
+                    answer.state,
+                    ritz.evaluate(solved, answer.grid, answer.state),
+                    slack=SLACK * ladder.goal(tolerance),
+                )
+                same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
+                answer.index = where[answer.index]
+                answer.steps = steps[answer.index]
+                answers.append(answer.take(same))
+                if not same.all():
+                    again.append((answer.index[~same], Start(answer.grid, answer.state).take(~same)))

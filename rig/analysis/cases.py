@@ -1,0 +1,153 @@
+"""Films given as plain data, solved: what stands behind ``dea-rig solve CASES.json``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from model.material.materials import Material
+from model.membrane.solve import Solutions, Status, Wrinkling, solve_many
+from model.specimen import Specimen
+
+NUMBERS = ("a", "b", "thickness", "prestretch", "h")
+OPTIONAL = {"voltage": 0.0, "tolerance": 1e-8}
+KEYS = ("id", *NUMBERS, *OPTIONAL, "wrinkling", "material")
+WRINKLING = ("plain", "tension_field")
+
+
+class CaseError(ValueError):
+    """A case that does not describe a film; its text says which key, which value and what is allowed."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case that can be solved."""
+
+    specimen: Specimen
+    h: float
+    voltage: float
+    tolerance: float
+    wrinkling: Wrinkling
+
+
+def solve_cases(cases: Any) -> list[dict[str, Any]]:
+    """Solve a list of cases; the answers stand in the same order.
+
+    A case is an object with, in SI units, ``id, a, b, thickness, prestretch, h, voltage, wrinkling`` ("plain" or
+    "tension_field"), ``material {mu: [...], alpha: [...], eps_r}`` and optionally ``tolerance`` (relative, of the
+    force); ``voltage`` 0, ``wrinkling`` "plain" and ``tolerance`` 1e-8 when left out. An answer has ``id, status, F,
+    error_estimate, peak_field, min_hoop_stress, max_stretch, iterations``, the numbers None when there is no answer,
+    and then a ``message``. A bad case gets the status "invalid" and does not touch its neighbours.
+
+    Raises
+    ------
+    CaseError : ``cases`` is not a list
+    """
+    if not isinstance(cases, list):
+        raise CaseError(f"the cases must be a JSON list of objects, not {_kind(cases)}")
+    answers: list[dict[str, Any]] = []
+    groups: dict[tuple[Wrinkling, float], list[tuple[int, Case]]] = {}
+    for number, raw in enumerate(cases):
+        name = raw.get("id") if isinstance(raw, dict) else None
+        answers.append({"id": name})
+        try:
+            case = read_case(raw)
+        except (CaseError, ValueError) as error:
+            answers[number] |= _numbers(None, 0) | {"status": "invalid", "message": str(error)}
+        else:
+            groups.setdefault((case.wrinkling, case.tolerance), []).append((number, case))
+    for (wrinkling, tolerance), members in groups.items():
+        films = [case.specimen for _, case in members]
+        h, v = (np.array([getattr(case, key) for _, case in members]) for key in ("h", "voltage"))
+        found = solve_many(films, h, v, tolerance=tolerance, wrinkling=wrinkling)
+        for at, (number, _) in enumerate(members):
+            status = Status(int(found.status[at]))
+            answers[number] |= {"status": status.name.lower()} | _numbers(found, at)
+            if not found.answered[at]:
+                answers[number]["message"] = status.message
+    return [{key: answer[key] for key in _ORDER if key in answer} for answer in answers]
+
+
+_FIELDS = {
+    "F": "force",
+    "error_estimate": "error_estimate",
+    "peak_field": "peak_field",
+    "min_hoop_stress": "min_hoop_stress",
+    "max_stretch": "max_stretch",
+}
+_ORDER = ("id", "status", *_FIELDS, "iterations", "message")
+
+
+def _numbers(found: Solutions | None, at: int) -> dict[str, Any]:
+    if found is None:
+        return dict.fromkeys(_FIELDS) | {"iterations": 0}
+    values = {key: float(getattr(found, name)[at]) for key, name in _FIELDS.items()}
+    return {key: value if math.isfinite(value) else None for key, value in values.items()} | {
+        "iterations": int(found.iterations[at])
+    }
+
+
+def read_case(raw: Any) -> Case:
+    """One case, checked.
+
+    Raises
+    ------
+    CaseError, ValueError : the case does not describe a film
+    """
+    table = _table(raw, "the case", KEYS, ("id", *NUMBERS, "material"))
+    material = _table(table["material"], "material", ("mu", "alpha", "eps_r"), ("mu", "alpha", "eps_r"))
+    wrinkling = table.get("wrinkling", "plain")
+    if wrinkling not in WRINKLING:
+        raise CaseError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
+    values = {key: _number(table[key], key) for key in NUMBERS}
+    values |= {key: _number(table.get(key, default), key) for key, default in OPTIONAL.items()}
+    if not 1e-12 <= values["tolerance"] <= 1e-2:
+        raise CaseError(f"tolerance = {values['tolerance']!r}: allowed are 1e-12 to 1e-2")
+    film = Specimen(
+        disk_radius=values["a"],
+        ring_radius=values["b"],
+        thickness=values["thickness"],
+        prestretch=values["prestretch"],
+        material=Material(
+            name="case",
+            mu=_list(material["mu"], "material.mu"),
+            alpha=_list(material["alpha"], "material.alpha"),
+            eps_r=_number(material["eps_r"], "material.eps_r"),
+        ),
+    )
+    return Case(film, values["h"], values["voltage"], values["tolerance"], cast(Wrinkling, wrinkling))
+
+
+def _kind(value: Any) -> str:
+    return {dict: "an object", list: "a list", str: "a text", type(None): "null"}.get(type(value), repr(value))
+
+
+def _table(raw: Any, name: str, allowed: tuple[str, ...], needed: tuple[str, ...]) -> dict[str, Any]:
+    if not isinstance(raw, dict):
+        raise CaseError(f"{name} must be an object, not {_kind(raw)}")
+    if unknown := [key for key in raw if key not in allowed]:
+        raise CaseError(f"{name} has an unknown key {unknown[0]!r}; allowed are {', '.join(allowed)}")
+    if missing := [key for key in needed if key not in raw]:
+        raise CaseError(f"{name} lacks the key {missing[0]!r}")
+    return raw
+
+
+def _number(value: Any, key: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise CaseError(f"{key} must be a number, not {_kind(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise CaseError(f"{key} = {value}: it must be finite")
+    return number
+
+
+def _list(values: Any, key: str) -> tuple[float, ...]:
+    if not isinstance(values, list):
+        raise CaseError(f"{key} must be a list of numbers, not {_kind(values)}")
+    return tuple(_number(value, f"{key}[{i}]") for i, value in enumerate(values))

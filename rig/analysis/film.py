@@ -1,0 +1,302 @@
+"""From logs to parameters: curves out of logs, one identification over all of them, results as JSON and HTML."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.film.curve import Curve, CurveError
+from calibration.film.identify import IdentificationError, compare, identify
+from calibration.film.result import Identification
+from calibration.sensors.certificate import Certificate, CertificateError
+from calibration.sheet.sheet_tests import TestsError, TestsFit, fit_tests, load_test
+from model.material.materials import Material
+from rig.base.errors import ConfigError, DataError
+from rig.base.toml_file import parse_table
+from rig.experiment import IN_MEMORY
+from rig.log.dataset import CurveErrors, Run, load_run
+from rig.scene.scene import Scene
+
+# Of a rig that nobody pressed on (m/N): load cells for a newton give way by some 0.3 mm at full scale.
+UNKNOWN_COMPLIANCE = 3e-4
+# Of the force behind the displacement where nobody measured it (s): filters of amplifiers and buffers of adapters.
+UNKNOWN_LAG = 5e-3
+NOISE_SIGMAS = 5.0  # by this much of its noise a sensor may read beyond its calibrated range
+# A sample belongs to its curve while the measured voltage is this near to the nominal one.
+VOLTAGE_V, VOLTAGE_PART = 50.0, 0.05
+
+
+@dataclass(frozen=True)
+class Found:
+    """An identification with what it came from.
+
+    ``truth`` is the hidden film of the simulation, when all logs are of one and the same simulated film.
+    """
+
+    identification: Identification
+    curves: list[Curve]
+    runs: list[Run]
+    provenance: dict[str, object]
+    truth: Material | None
+    notes: list[str]
+    comparison: list[Identification] = field(default_factory=list)
+
+
+def identify_logs(
+    paths: Sequence[Path],
+    *,
+    terms: int = 2,
+    comparing: bool = False,
+    profiles: bool = False,
+    wrinkled: str = "left-out",
+    posterior: bool = False,
+    progress: Callable[[float, float, str], None] = lambda done, total, label: None,
+) -> Found:
+    """Identify the film from all recorded curves of all logs at once.
+
+    ``comparing`` judges 1, 2 and 3 Ogden terms beside each other, ``profiles`` adds 95 % intervals from profile
+    likelihood; each takes a few seconds more. ``posterior`` adds Markov chains, which take a minute or more and tell
+    ``progress``. ``wrinkled`` is "left-out" or "tension-field".
+
+    Raises
+    ------
+    LogError, DataError
+        When a log cannot be read, lacks what is needed, or the curves cannot be fitted.
+    """
+    runs = [load_run(path) for path in paths]
+    scenes = [parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)") for run in runs]
+    hashes = {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    provenance: dict[str, object] = {
+        "logs": hashes,
+        "outcomes": {str(run.log.path): (run.log.outcome or {}).get("status", "cut off") for run in runs},
+    }
+    if len(set(hashes.values())) < len(paths):
+        raise DataError("The same log is given twice; it would count as if it had been measured twice.")
+    curves: list[Curve] = []
+    try:
+        for run, scene in zip(runs, scenes, strict=True):
+            certificates = run.certificates
+            found = run.curves(scene.specimen.specimen(), **_errors(run, scene, certificates))
+            corrected = [_without_compliance(curve, run, certificates) for curve in found]
+            inside = [_in_calibrated_range(_at_its_voltage(curve), certificates) for curve in corrected]
+            curves += [_with_drift(curve, certificates) for curve in inside]
+        if not curves:
+            raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
+        options: dict[str, Any] = {
+            "profiles": profiles,
+            "provenance": provenance,
+            "wrinkling": "tension_field" if wrinkled == "tension-field" else "plain",
+            "reach": min(scene.limits.displacement_mm for scene in scenes) * 1e-3,
+        }
+        comparison = compare(curves, **options) if comparing else []
+        same = [one for one in comparison if one.terms == terms]
+        identification = same[0] if same else identify(curves, terms=terms, **options)
+        if posterior:
+            from calibration.film.posterior import posterior as sample
+
+            identification = replace(identification, posterior=sample(curves, identification, progress=progress))
+    except (CurveError, IdentificationError, CertificateError) as error:
+        raise DataError(f"{error}.") from None
+    return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs), comparison)
+
+
+def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certificate]) -> Curve:
+    """Where the stage's way stands for the disk's: the part of it that the rig gives way is taken off."""
+    stage = certificates.get("stage")
+    if run.has_laser or stage is None:
+        return curve
+    return curve.without_compliance(stage.compliance)
+
+
+def _in_calibrated_range(curve: Curve, certificates: Mapping[str, Certificate]) -> Curve:
+    """The curve with those samples flagged at which a sensor was beyond what it is calibrated for.
+
+    Beyond by more than its noise: a calibration that begins at zero covers an unloaded sensor.
+    """
+    beyond = np.zeros(curve.h.shape, dtype=np.bool_)
+    for role, values in (("force", curve.force), ("hv", curve.voltage)):
+        used = certificates.get(role)
+        if used is not None:
+            margin = NOISE_SIGMAS * used.noise + used.zero_uncertainty
+            beyond |= ~((values >= used.low - margin) & (values <= used.high + margin)) & np.isfinite(values)
+    return replace(curve, flagged=beyond if curve.flagged is None else curve.flagged | beyond)
+
+
+def _at_its_voltage(curve: Curve) -> Curve:
+    """The curve with those samples flagged at which the measured voltage was not the nominal one."""
+    allowed = max(  # A sample belongs to its curve while the measured voltage is this near to the nominal one.
+        VOLTAGE_V, VOLTAGE_PART * abs(curve.nominal_voltage)
+    )
+    elsewhere = ~(np.abs(curve.voltage - curve.nominal_voltage) <= allowed) & np.isfinite(curve.voltage)
+    return replace(curve, flagged=elsewhere if curve.flagged is None else curve.flagged | elsewhere)
+
+
+def _notes(runs: Sequence[Run]) -> list[str]:
+    """What a reader of the result must know of the logs."""
+    notes = []
+    for run in runs:
+        log = run.log
+        notes += [f"{log.path}: {problem}" for problem in _certificate_problems(run)]
+        if not run.has_laser and "stage" not in run.certificates:
+            notes.append(
+                f"{log.path}: the stage's way stands for the disk's, and how far the rig gives way is not known; it "
+                f"is fitted along (within {1e6 * UNKNOWN_COMPLIANCE:.0f} um/N), which makes the results less certain. "
+                "`dea-rig calibrate compliance` tells"
+            )
+        for there, role, device in (
+            (run.has_laser, "displacement", "displacement sensor"),
+            (run.has_hv, "hv", "HV supply"),
+        ):
+            if there and role not in run.certificates:
+                notes.append(
+                    f"{log.path}: the {device} has no certificate; its readings are taken as they are, and the "
+                    f"uncertainties contain nothing of their errors. `dea-rig calibrate {role}` makes one"
+                )
+        if not log.whole:
+            notes.append(f"{log.path} is cut short or damaged; `dea-rig info {log.path}` tells what is missing")
+        status = (log.outcome or {}).get("status", "unknown")
+        if status != "complete":
+            notes.append(f"{log.path} is of a run that did not come to its end: {status}")
+    return notes
+
+
+def _certificate_problems(run: Run) -> list[str]:
+    """What the run itself noted against the certificates that it used: their dates, another serial number."""
+    noted = run.log.metadata.get("run", {}).get("certificate_problems", "")
+    problems = [problem for problem in noted.split("; ") if problem]
+    for message in run.log.messages("/event"):
+        text = message.fields["message"]
+        if message.fields["severity"] == "warning" and " certificate " in text and text not in problems:
+            problems.append(text)
+    return problems
+
+
+def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
+    """Write the result as JSON and as an HTML report; each appears whole or not at all.
+
+    Raises
+    ------
+    ConfigError
+        When a file cannot be written.
+    """
+    try:
+        if fit is not None:
+            write_text(fit, found.identification.to_json(found.comparison))
+        if report is not None:
+            from calibration.report.report import write_report
+
+            write_report(
+                report,
+                found.identification,
+                found.curves,
+                scene_texts={str(run.log.path): run.scene for run in found.runs},
+                provenance=found.provenance,
+                truth=found.truth,
+                comparison=found.comparison,
+            )
+    except OSError as error:
+        raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file that appears whole or not at all.
+
+    Raises
+    ------
+    ConfigError
+        When it cannot be written.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}.") from None
+
+
+def identify_tests(tests: Sequence[Path], predict: Sequence[Path], terms: int) -> TestsFit:
+    """Identify Ogden terms from homogeneous tests in CSV files; ``predict`` are held against the result.
+
+    Raises
+    ------
+    DataError
+        When a file cannot be read as a test, or the tests cannot be fitted.
+    """
+    try:
+        return fit_tests(
+            [load_test(path) for path in tests], terms=terms, predict=[load_test(path) for path in predict]
+        )
+    except TestsError as error:
+        raise DataError(f"{error}.") from None
+
+
+def _with_drift(curve: Curve, certificates: Mapping[str, Certificate]) -> Curve:
+    """The curve with what its sensors' zeros may drift during a run, besides the error with which they were taken."""
+    drift = {role: certificate.zero_uncertainty for role, certificate in certificates.items()}
+    return replace(
+        curve,
+        force_zero=math.hypot(curve.force_zero, drift.get("force", 0.0)),
+        displacement_zero=math.hypot(curve.displacement_zero, drift.get("displacement", 0.0)),
+    )
+
+
+def _errors(run: Run, scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErrors:
+    """Noise and uncertainties of a run's curves, from the certificates in its log and from the scene."""
+    force = certificates.get("force")
+    if force is None:
+        raise DataError(f"{run.log.path}: the log holds no certificate of the force sensor; its noise is not known.")
+    return errors_of(scene, certificates)
+
+
+def errors_of(scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErrors:
+    """Noise and uncertainties of the curves of a scene with these certificates; that of the force must be there."""
+    force, dimensions = certificates["force"], scene.specimen
+    errors = CurveErrors(
+        force_noise=force.noise,
+        force_gain=force.gain_uncertainty,
+        thickness_uncertainty=dimensions.thickness_uncertainty_um / dimensions.thickness_um,
+        prestretch_uncertainty=dimensions.prestretch_uncertainty / dimensions.prestretch,
+        disk_radius_uncertainty=dimensions.disk_radius_uncertainty_mm / dimensions.disk_radius_mm,
+        eccentricity=dimensions.eccentricity_mm * 1e-3,
+    )
+    laser, hv = certificates.get("displacement"), certificates.get("hv")
+    if laser is not None:
+        errors["displacement_noise"] = laser.noise
+        errors["displacement_gain"] = laser.gain_uncertainty
+    elif scene.displacement is None:
+        stage = certificates.get("stage")
+        errors["compliance_uncertainty"] = UNKNOWN_COMPLIANCE if stage is None else stage.compliance_uncertainty
+    timed = [certificate for certificate in (force, laser) if certificate is not None]
+    known = [certificate.lag_uncertainty for certificate in timed]
+    complete = all(known) and (laser is not None or scene.displacement is None)
+    errors["lag_uncertainty"] = math.hypot(*known) if complete else UNKNOWN_LAG
+    if hv is not None:
+        errors["voltage_gain"] = hv.gain_uncertainty
+    return errors
+
+
+def _truth(runs: Sequence[Run], scenes: Sequence[Scene]) -> Material | None:
+    if any(run.log.metadata.get("run", {}).get("bench") != IN_MEMORY for run in runs):
+        return None
+    truths = set()
+    for scene in scenes:
+        if scene.simulation is None:
+            return None
+        film, believed = scene.simulation.film, scene.specimen.specimen().material
+        truths.add(
+            (
+                tuple(film.mu_Pa) if film.mu_Pa is not None else believed.mu,
+                tuple(film.alpha) if film.alpha is not None else believed.alpha,
+                film.eps_r if film.eps_r is not None else believed.eps_r,
+            )
+        )
+    if len(truths) != 1:
+        return None
+    mu, alpha, eps_r = truths.pop()
+    return Material(name="the simulation's truth", mu=mu, alpha=alpha, eps_r=eps_r)

@@ -1,0 +1,479 @@
+"""The engine: one single-threaded loop that polls the instruments, judges what they say and carries out the plan.
+
+Whatever ends a run, `rig.engine.teardown` comes after it: the output goes off, the stage stops, and the log says by
+*measured*
+values in what state the rig was left. What the operator wants (`rig.operator.control`) is looked at once a turn: a
+stop ends the
+run or hastens the teardown, a pause lets the voltage down and, once continued, begins the interrupted action anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from drivers.links.link import DeviceError, DeviceSilent
+from drivers.roles import HVSample, Sample
+from rig.actions import Turns, carry_out, choose_about_live_output, confirm_voltage, rest
+from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
+from rig.base.host import HostTime
+from rig.bench.bench import Bench
+from rig.engine.teardown import Rest, Teardown
+from rig.engine.watch import Watch, allowed_silence
+from rig.log.recorder import Gains, Recorder, Severity
+from rig.operator.control import Answer, Control, Question
+from rig.protocol.plan import Action
+from rig.safety import heartbeat
+from rig.safety.arming import Arming
+from rig.safety.guard import AnyGuard, Guard, GuardState
+from rig.safety.limits import FilmLimits, Limit, Limits
+
+if TYPE_CHECKING:
+    from calibration.sensors.certificate import Certificate
+    from rig.log.process import LogProcess
+    from rig.log.writer import LogWriter
+
+SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
+SETUP_LIMIT_S = 15.0
+SNAPSHOT_S = 1.0  # before and after what ended a run under voltage: the log holds every sample of it, and says where
+ROUNDING_S = 1e-6  # of clock times: whether a turn is the last one must not hang on the last digit
+HANDS = ("prompt", "mount", "weigh", "creep")  # kinds of actions in which the operator touches the rig
+OUTPUT_LIMIT_S = 3.0  # how long a supply may take after set-up to be measured off
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Why the run ended, and the measured state it ended in.
+
+    ``status`` is one of complete, stopped, limit, fault. ``safe`` is True only when the output was *measured* below
+    60 V twice, or when the scene has no HV; ``standing`` only when the stage said that it stands still.
+    """
+
+    status: str
+    reason: str
+    safe: bool
+    standing: bool
+    voltage: float
+    force: float
+    position: float
+    duration: float
+
+    @property
+    def state(self) -> str:
+        """The state of stage and output, in words for the operator."""
+        stage = "stage standing" if self.standing else "stage NOT CONFIRMED to stand, it may be moving: cut its power"
+        if math.isnan(self.voltage):
+            output = "no high voltage in this scene" if self.safe else "high voltage NOT SAFE: never measured"
+        else:
+            output = (
+                f"high voltage {'off, measured' if self.safe else 'NOT SAFE, last measured'} {round(self.voltage)} V"
+            )
+        return f"{stage}; {output}"
+
+    def as_text(self) -> dict[str, str]:
+        """As the log's metadata: text only, units in the names."""
+        return {
+            "status": self.status,
+            "reason": self.reason,
+            "safe": "yes" if self.safe else "NO",
+            "stage_standing": "yes" if self.standing else "NOT CONFIRMED",
+            "measured_voltage_V": f"{self.voltage:.1f}",
+            "measured_force_N": f"{self.force:.5f}",
+            "stage_position_mm": f"{self.position * 1e3:.4f}",
+            "duration_s": f"{self.duration:.3f}",
+        }
+
+
+def _lets_ramp_down(error: Exception) -> bool:
+    """Whether a run that ended so may ramp its voltage down; otherwise the output is taken off at once."""
+    silent = isinstance(error, DeviceSilent) and not error.device.startswith("hv")
+    return silent or isinstance(error, Stopped | StaleData)
+
+
+class Engine:
+    """Runs one plan on one bench into one log.
+
+    Parameters
+    ----------
+    bench : Bench
+        Opened, not yet attached.
+    actions : sequence of Action
+        From `rig.protocol.plan.plan`, already checked.
+    log : LogWriter or LogProcess
+        Open; the engine writes rows, the caller attaches scene and protocol and finishes it.
+    gains : Gains
+        From the sensors' certificates.
+    control : Control
+        What the operator wants; looked at once a turn.
+    progress : callable
+        ``progress(done_s, total_s, label)`` about five times a second of the bench's time. Its errors end the
+        display, not the run.
+    certificates : mapping of str to Certificate
+        By role, to be held against the serial numbers that the instruments state.
+    requested : str
+        How the operator asked for high voltage when he started the run; without it none is given.
+    take_down : str
+        How he chose, when he started the run, to have an output taken down that is found live; empty: he did not.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        actions: Sequence[Action],
+        log: LogWriter | LogProcess,
+        gains: Gains,
+        control: Control,
+        progress: Callable[[float, float, str], None],
+        certificates: Mapping[str, Certificate] | None = None,
+        requested: str = "",
+        take_down: str = "",
+    ) -> None:
+        self.bench = bench
+        self.clock = bench.clock
+        self.gains = gains
+        self.recorder = Recorder(log, self.clock, gains, has_laser=bench.scene.displacement is not None)
+        self.limits = Limits.of(bench.scene)
+        self.force_noise = math.nan
+        self.listener: Callable[[Sample], None] | None = None
+        self.control = control
+        self.arming = Arming(requested)
+        self.take_down = take_down
+        self.highest_voltage = max((level for action in actions for level in action.voltage), default=0.0)
+        self._actions = actions
+        self._progress = progress
+        self._certificates = certificates or {}
+        self.guard: AnyGuard | None = None
+        self._host = HostTime(self.clock)
+        self._beats = 0
+        self._next_beat = -math.inf
+        self._watch: Watch | None = None
+        self._started = self.clock.now()
+        self._next_progress = 0.0
+        self._doing = ""
+
+    # What actions may do -------------------------------------------------------------------------------------
+
+    def command(self, device: str, command: str, argument: str) -> None:
+        """Write a command to the log before it is given, its numbers in full: `rig.replay` gives it again."""
+        self.recorder.command(device, command, argument)
+
+    def move_stage(self, position: float, speed: float) -> None:
+        """Move the stage to ``position`` metres of its own scale."""
+        self.limits.speed.check(speed, "Stage speed")
+        self.recorder.speed = speed
+        self.command("stage", "move_to", f"{float(position)!r} m at {speed!r} m/s")
+        self.bench.stage.move_to(position, speed)
+
+    def move_to(self, h: float, speed: float) -> None:
+        """Move the disk to displacement ``h`` metres, with the film checked along the way when there is HV."""
+        self.limits.displacement.check(h, "Displacement set-point")
+        voltage = 0.0
+        if self.guard is not None:
+            voltage = self.guard.setpoint
+            self.guard.check_move(self.recorder.displacement, h)
+        self.recorder.target(h, voltage, speed)
+        self.move_stage(self.recorder.contact + h, speed)
+
+    def stop_stage(self) -> None:
+        """Decelerate to a standstill."""
+        self.command("stage", "stop", "")
+        self.bench.stage.stop()
+
+    def request_voltage(self, volts: float) -> None:
+        """Ask the guard for a voltage at the displacement where the film is; a guard that is SAFE is armed for it.
+
+        Before contact the disk lies where the flat film holds it, at zero.
+        """
+        if self.guard is None:
+            raise FaultError(f"{volts:g} V asked for, but the scene has no HV.")
+        if self.guard.state is GuardState.SAFE:
+            self.arming.check(volts)
+            self.event("hv", f"armed by two acts: {self.arming.requested}; {self.arming.confirmed}")
+            self.guard.arm()
+        h = self.recorder.displacement if math.isfinite(self.recorder.contact) else 0.0
+        self.recorder.target(h, volts, 0.0)
+        self.guard.request(volts, h)
+
+    def event(self, source: str, message: str) -> None:
+        """Write to the log what a reader of it should know."""
+        self.recorder.event("info", source, message)
+
+    def learn(self, role: str, readings: Sequence[float]) -> None:
+        """Let the watch learn the noise of an unloaded sensor."""
+        if self._watch is not None and readings:
+            self._watch.learn(role, readings)
+
+    def ask(self, question: Question) -> Generator[None, None, Answer]:
+        """Ask the operator and yield until he has answered; question and answer go into the log."""
+        self.event("operator", f"asked: {question.text}")
+        self.control.put(question)
+        try:
+            while (answer := self.control.answer) is None:
+                yield
+        finally:
+            self.control.withdraw()
+        self.event("operator", f"answered: {answer}")
+        return answer
+
+    # The run -------------------------------------------------------------------------------------------------
+
+    def run(self) -> tuple[Outcome, Exception | None]:
+        """Carry out the plan and leave the rig safe. The error, if any, is what ended the run."""
+        status, reason = "complete", "the protocol ended"
+        error: Exception | None = None
+        try:
+            self.bench.attach(self.recorder.wire)
+            self._appoint_guard()
+            self._set_up()
+            self._watch = Watch(self.bench, self.recorder, self.limits, self.guard)
+            if self.highest_voltage > 0 and not self._hands_come_first():
+                self._take_turns(confirm_voltage(self))
+            self._carry_out_all()
+        except Stopped as caught:
+            status, error = "stopped", caught
+        except LimitError as caught:
+            status, error = "limit", caught
+        except Exception as caught:  # a mistake of ours must end as safely as a fault of the rig
+            status, error = "fault", caught
+        if error is not None:
+            known = isinstance(error, RigError | DeviceError)
+            reason = str(error) if known else f"internal error: {error!r}"
+            if self._doing:
+                error.add_note(f"It happened during {self._doing}.")
+        ended = self.clock.now()
+        snapshot = status in ("limit", "fault") and self.guard is not None and self.guard.commanded
+        rest = Teardown(self.bench, self.guard, self.recorder, self.control).run(
+            reason,
+            error is None or _lets_ramp_down(error),
+            self._next_turn,
+            ended + SNAPSHOT_S - ROUNDING_S if snapshot else ended,
+        )
+        if snapshot:
+            self.recorder.snapshot(reason, ended, SNAPSHOT_S, SNAPSHOT_S)
+        for role, device in self.bench.devices.items():
+            counted = ", ".join(f"{key}={value}" for key, value in sorted(device.counters.items()) if value)
+            self.recorder.event("info", role, f"counted: {counted or 'nothing'}")
+        if error is not None:
+            self.recorder.event("error", "engine", reason)
+        return self._outcome(status, reason, rest), error
+
+    def _hands_come_first(self) -> bool:
+        """Whether somebody may touch the rig before there is voltage: then it is confirmed after that."""
+        for action in self._actions:
+            if action.kind in HANDS:
+                return True
+            if max(action.voltage) > 0:
+                return False
+        return False
+
+    def _appoint_guard(self) -> None:
+        scene, process = self.bench.scene, self.bench.guard_process
+        if scene.hv is None:
+            return
+
+        def tell(command: str, argument: str, t: float | None = None) -> None:
+            self.recorder.command("hv", command, argument, t)
+
+        def event(severity: Severity, message: str) -> None:
+            self.recorder.event(severity, "guard", message)
+
+        allowed = allowed_silence(self.bench)
+        fresh = {role: allowed[role] + heartbeat.MARGIN_S for role in heartbeat.ROLES if role in allowed}
+        if process is not None:
+            process.appoint(self.gains.voltage, fresh, tell, event)
+            self.guard = process
+        else:
+            assert self.bench.hv is not None
+            film = FilmLimits(scene.specimen.specimen(), self.limits)
+            self.guard = Guard(self.bench.hv, self.limits, film, scene.hv.ramp_V_per_s, tell, fresh)
+        if not scene.hv.measures_current:
+            self.recorder.event("warning", "hv", "this supply does not measure its current: nothing watches it")
+
+    def _set_up(self) -> None:
+        """Poll until every driver has finished its set-up dialogue; then check who answered, and that HV is off."""
+        devices = self.bench.devices
+        end = self.clock.now() + SETUP_LIMIT_S
+        while not all(device.ready for device in devices.values()):
+            self._turn()
+            if self.clock.now() > end:
+                waiting = [name for name, device in devices.items() if not device.ready]
+                raise FaultError(f"{', '.join(waiting)}: not ready within {SETUP_LIMIT_S:.0f} s of set-up.")
+        for role in devices:
+            self._check_identity(role)
+        unit = self.bench.force.reading_unit
+        self.recorder.units(unit)
+        if unit != self.gains.force_unit:
+            raise ConfigError(
+                f"force: the certificate is for readings in {self.gains.force_unit}, but the instrument gives them in "
+                f"{unit}. Use the instrument's own certificate. Nothing was moved and no output changed."
+            )
+        self._check_devices()
+        self._check_output()
+
+    def _check_devices(self) -> None:
+        """What the plan needs and these devices cannot do is refused while nothing has moved."""
+        if self.guard is not None and self.highest_voltage > 0:
+            self.guard.check_supply(self.highest_voltage)
+        start = self.bench.scene.stage.approach_from_mm * 1e-3
+        if any(action.kind == "approach" for action in self._actions):
+            travel = Limit("stage position", *self.bench.stage.travel, "mm", 1e3)
+            travel.check(start, "stage.approach_from_mm, for this stage")
+            ends = [end for action in self._actions for end in action.h]
+            travel.check(start + min(ends), "Clearance of the return step, where the film can be met first")
+            travel.check(start + max(ends), "Largest displacement, where the film can be met first")
+
+    def _check_identity(self, role: str) -> None:
+        table, device = self.bench.scene.instruments[role], self.bench.devices[role]
+        found = device.identity
+        known = {**device.settings, **self.bench.link_settings(role)}
+        settings = ", ".join(f"{key}={value}" for key, value in sorted(known.items()))
+        self.recorder.event(
+            "info", role, f"model {found.model}, serial {found.serial}, firmware {found.firmware}; {settings}"
+        )
+        if table.serial is not None and table.serial != found.serial:
+            raise ConfigError(
+                f"{role}: serial number {table.serial} is wanted, but {found.serial or 'no serial number'} "
+                "answered. Are two instruments swapped? Nothing was moved and no output changed."
+            )
+        certificate = self._certificates.get(role)
+        if certificate is not None:
+            today = datetime.fromtimestamp(self.clock.epoch_ns(self.clock.now()) * 1e-9, UTC).date()
+            for problem in certificate.check(found.serial, today):
+                self.recorder.event("warning", role, problem)
+
+    def _check_output(self) -> None:
+        """High voltage must be measured off before anything moves: nobody stretches a film under unknown voltage."""
+        guard = self.guard
+        if guard is None:
+            return
+        end = self.clock.now() + OUTPUT_LIMIT_S
+        while not guard.output_is_safe and self.clock.now() < end:
+            self._turn()
+        self._take_turns(choose_about_live_output(self))
+        guard.check_off()
+
+    def _carry_out_all(self) -> None:
+        total = sum(action.duration for action in self._actions)
+        done = 0.0
+        for action in self._actions:
+            while not self._carry_out(action, done, total):
+                self._pause(action, done, total)
+            done += action.duration
+            self._show(done, total, self._doing)
+
+    def _carry_out(self, action: Action, done: float, total: float) -> bool:
+        """Whether the action came to its end; False when the operator wants a pause."""
+        began = self.clock.now()
+        self._phase(action, action.kind, action.label, action.voltage[1], record=action.record)
+        label = self._doing = self.control.doing = f"step {action.step} {action.kind}: {action.label}"
+        with closing(carry_out(self, action)) as turns:
+            for _ in turns:
+                self._show_now_and_then(done + min(self.clock.now() - began, action.duration), total, label)
+                self._turn()
+                if self.control.pausing:
+                    return False
+        return True
+
+    def _pause(self, action: Action, done: float, total: float) -> None:
+        """Stage standing, voltage down; once the operator continues, back to where the action begins."""
+        self.event("operator", f"paused by {self.control.pausing} during {self._doing}")
+        self._phase(action, "pause", "the operator's pause", 0.0, record=False)
+        with closing(rest(self, action)) as turns:
+            for _ in turns:
+                self._show_now_and_then(done, total, f"paused: {self._doing}")
+                self._turn()
+
+    def _take_turns(self, turns: Turns) -> None:
+        with closing(turns):
+            for _ in turns:
+                self._turn()
+
+    def _phase(self, action: Action, kind: str, label: str, voltage: float, *, record: bool) -> None:
+        self.recorder.phase(
+            {
+                "step": action.step,
+                "kind": kind,
+                "label": label,
+                "cycle": action.cycle,
+                "direction": action.direction,
+                "voltage_V": voltage,
+                "record": record,
+            }
+        )
+
+    def _show_now_and_then(self, done: float, total: float, label: str) -> None:
+        if self.clock.now() >= self._next_progress:
+            self._next_progress = self.clock.now() + 0.2
+            question = self.control.question
+            self._show(done, total, f"waiting for you: {question.text}" if question is not None else label)
+
+    def _show(self, done: float, total: float, label: str) -> None:
+        """Show progress. A terminal that is gone must not end an experiment."""
+        try:
+            self._progress(done, total, label)
+        except Exception as error:
+            self._progress = lambda done, total, label: None
+            self.recorder.event("warning", "engine", f"the display of progress failed: {error!r}")
+
+    def _turn(self) -> None:
+        """One turn of the loop: poll, judge, write, wait."""
+        began = self.recorder.turn = self.clock.now()
+        self.control.poll(began)
+        if self.control.count:
+            raise Stopped(f"stopped by {self.control.source}")
+        for role in self.bench.devices:
+            # Each device its own time: data must never seem to have come before they were sent.
+            now = self.clock.now()
+            for sample in self.bench.poll(role, now):
+                self._take(role, sample, now)
+        now = self.clock.now()
+        if step := self._host.check():
+            message = f"the host's calendar was set by {step:+.3f} s; this log goes on by the calendar as it was"
+            self.recorder.event("warning", "host", message)
+        if self._watch is not None:
+            self._watch.turn(now)
+            self._beat(self._watch, now)
+        self.recorder.tick(now)
+        self.clock.sleep_until(self._next_turn(began))
+
+    def _beat(self, watch: Watch, now: float) -> None:
+        """Tell the guard that this loop turns, and on how fresh data. Nothing else ever does."""
+        guard = self.guard
+        if guard is None:
+            return
+        if now >= self._next_beat:
+            self._next_beat = now + heartbeat.INTERVAL_S
+            self._beats += 1
+            beat = heartbeat.Heartbeat(self._beats, now, self.recorder.displacement, watch.newest_good)
+            guard.heartbeat(beat.encode(), now)
+        guard.turn(now)
+
+    def _next_turn(self, now: float) -> float:
+        wanted = min(device.next_poll for device in self.bench.devices.values())
+        return min(max(wanted, now + SHORTEST_TURN_S), now + LONGEST_TURN_S)
+
+    def _take(self, role: str, sample: Sample, now: float) -> None:
+        sample = self.recorder.add(sample)
+        if isinstance(sample, HVSample) and self.guard is not None:
+            self.guard.on_sample(sample)
+        if self._watch is not None:
+            self._watch.sample(role, sample, now)
+        if self.listener is not None:
+            self.listener(sample)
+
+    def _outcome(self, status: str, reason: str, rest: Rest) -> Outcome:
+        recorder = self.recorder
+        return Outcome(
+            status=status,
+            reason=reason,
+            safe=rest.safe,
+            standing=rest.standing,
+            voltage=recorder.hv.voltage if recorder.hv is not None else math.nan,
+            force=recorder.force,
+            position=recorder.stage.position if recorder.stage is not None else math.nan,
+            duration=self.clock.now() - self._started,
+        )

@@ -1,0 +1,249 @@
+"""What the operator wants of a run while it goes on: to stop it, pause it, let it continue, or answer a question.
+
+Wishes come from signals (`rig.operator.signals`), from the keyboard of the run's own terminal, and from other
+terminals of the
+same user (`rig.operator.remote`). They are only noted down here; the engine's loop looks once a turn and never waits
+for input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import select
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from rig.operator.signals import StopRequest
+
+MOST_LINES = 100  # that may wait to be shown
+PATIENCE_S = 0.5  # at the end, for what is left to be shown
+LOOK_S = 0.05  # how often keyboard and remote wishes are looked for
+STOP, PAUSE, CONTINUE = ("stop", "s", "q"), ("pause", "p"), ("continue", "c")
+HELP = "Type p to pause, c to continue, s to stop (and Enter); Ctrl-C stops too."
+
+
+@dataclass(frozen=True)
+class Question:
+    """What the operator is asked. ``expected`` is what has to be typed, letter by letter; empty: anything will do."""
+
+    text: str
+    expected: str = ""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was answered, and by whom or what."""
+
+    text: str
+    source: str
+
+    def __str__(self) -> str:
+        return f"{self.text!r}, by {self.source}"
+
+
+class Source(Protocol):
+    """Where wishes come from. Reading never waits and never raises."""
+
+    name: str
+
+    def read(self, control: Control) -> Sequence[str]:
+        """The lines that have arrived since the last time."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Control(StopRequest):
+    """The operator's wishes for one run.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+        Looked at by `poll`.
+    unattended : str
+        When nobody is there to be asked: why every question may be answered as expected, for the log ("--yes on the
+        command line"). Empty when somebody is.
+    say : callable
+        Shows one line to the operator.
+    slow : bool
+        Whether that may take long or for ever, as on a terminal that has been stopped: then nobody waits for it.
+
+    Attributes
+    ----------
+    pausing : str
+        Who asked for a pause; empty while none is wanted.
+    question : Question or None
+        What the operator is being asked.
+    answer : Answer or None
+        The answer to it, once given.
+    doing : str
+        What the run is doing, for whoever asks from another terminal.
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[Source] = (),
+        unattended: str = "",
+        say: Callable[[str], None] = lambda text: None,
+        *,
+        slow: bool = False,
+    ) -> None:
+        super().__init__()
+        self.unattended = unattended
+        self.pausing = ""
+        self.question: Question | None = None
+        self.answer: Answer | None = None
+        self.doing = ""
+        self._sources = tuple(sources)
+        self._voice = Voice(say) if slow else None
+        self._say = say if self._voice is None else self._voice.say
+        self._next_look = 0.0
+
+    def ask_pause(self, source: str) -> None:
+        """Ask for a pause; while one lasts this changes nothing."""
+        self.pausing = self.pausing or source
+
+    def say(self, text: str) -> None:
+        """Show a line to the operator; a terminal that is gone is no reason to end a run."""
+        try:
+            self._say(text)
+        except Exception:
+            self._say = lambda text: None
+
+    def put(self, question: Question) -> None:
+        """Put a question. When nobody is there it is answered as expected at once."""
+        self.question, self.answer = question, None
+        if self.unattended:
+            self.answer = Answer(question.expected or "yes", self.unattended)
+            return
+        wanted = f"type {question.expected}" if question.expected else "press Enter, or type a remark for the log"
+        self.say(f"{question.text}\n  -> {wanted}; or s to stop. From another terminal: dea-rig continue")
+
+    def withdraw(self) -> None:
+        """The question is no longer asked."""
+        self.question = self.answer = None
+
+    def poll(self, now: float) -> None:
+        """Look for what the operator wants, at most every `LOOK_S` seconds of the bench's clock."""
+        if now < self._next_look:
+            return
+        self._next_look = now + LOOK_S
+        for source in self._sources:
+            for line in source.read(self):
+                self.say(self.take(line, source.name))
+
+    def take(self, line: str, source: str) -> str:
+        """Note down one line of the operator's; returns what he is told.
+
+        A word of command is obeyed always; while a question is open any other line is its answer.
+        """
+        text = line.strip()
+        word = text.lower()
+        if word in STOP:
+            self.ask(source)
+            return "Stopping: the voltage goes off, the stage stands." if self.count == 1 else "Hastened: off at once."
+        if word in PAUSE:
+            if self.pausing:
+                return "The run is paused already."
+            self.ask_pause(source)
+            return "Pausing: the stage stops, the voltage ramps to zero."
+        if self.question is not None and self.answer is None:  # the loop takes the answer at its next turn
+            if self.question.expected and text != self.question.expected:
+                return f"That is not what is asked for: type {self.question.expected}, or s to stop."
+            self.answer = Answer(text, source)
+            return "Answered."
+        if word in CONTINUE:
+            if not self.pausing:
+                return "The run is going on; there is nothing to continue."
+            self.pausing = ""
+            return "Continuing."
+        return HELP
+
+    def describe(self) -> dict[str, str]:
+        """The state of the run for another terminal."""
+        question = self.question if self.answer is None else None
+        state = "ending" if self.count else "asking" if question else "paused" if self.pausing else "running"
+        return {
+            "state": state,
+            "doing": self.doing,
+            "question": question.text if question is not None else "",
+            "expected": question.expected if question is not None else "",
+        }
+
+    def close(self) -> None:
+        """Close every source, and let what was said be shown if that is possible soon."""
+        if self._voice is not None:
+            self._voice.close()
+        for source in self._sources:
+            source.close()
+
+
+class Voice:
+    """Says lines on a thread of its own: a terminal that takes nothing must not hold up the loop."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._lines: queue.Queue[str | None] = queue.Queue(maxsize=MOST_LINES)
+        self._out = say
+        self._thread = threading.Thread(target=self._run, name="voice", daemon=True)
+        self._thread.start()
+
+    def say(self, text: str) -> None:
+        """Say it when it can be said; dropped when too much waits already."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(text)
+
+    def _run(self) -> None:
+        while (text := self._lines.get()) is not None:
+            try:
+                self._out(text)
+            except Exception:  # the terminal is gone
+                return
+
+    def close(self) -> None:
+        """End the thread, waiting only shortly for what is left to be said."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(PATIENCE_S)
+
+
+class Keyboard:
+    """Whole lines from the terminal that the run was started in. The terminal's settings stay as they are."""
+
+    name = "the keyboard"
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._open = True
+        self._rest = b""
+
+    @classmethod
+    def here(cls) -> Keyboard | None:
+        """The keyboard of this process's terminal; None when there is none, or the system has no `select` for it."""
+        try:
+            fd = sys.stdin.fileno()
+            return cls(fd) if os.name == "posix" and os.isatty(fd) else None
+        except (OSError, ValueError, AttributeError):
+            return None
+
+    def read(self, control: Control) -> list[str]:
+        try:
+            # In the background the keys belong to the shell, and reading them would stop this process.
+            if not self._open or os.tcgetpgrp(self._fd) != os.getpgrp():
+                return []
+            if not select.select([self._fd], [], [], 0)[0]:
+                return []
+            data = os.read(self._fd, 4096)
+        except OSError:  # not our terminal any more, or not now
+            return []
+        self._open = bool(data)  # Ctrl-D, or the terminal is gone
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        self._rest = self._rest[-4096:]
+        return [line.decode(errors="replace") for line in lines]
+
+    def close(self) -> None:
+        self._open = False

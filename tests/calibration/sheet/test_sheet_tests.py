@@ -1,0 +1,194 @@
+"""Homogeneous tests: published parameters on published data, joint fits, cross-mode prediction, strict reading."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.sheet.sheet_tests import (
+    HomogeneousTest,
+    TestsError,
+    _TestsProblem,
+    cross_prediction,
+    fit_tests,
+    load_test,
+    nominal_stress,
+    r_squared,
+)
+
+# Published test data, kept beside the project; without it the tests on it are skipped.
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
+OGDEN_1972 = ((0.63e6, 0.0012e6, -0.01e6), (1.3, 5.0, -2.0))  # Treloar's rubber, in this convention
+
+
+@pytest.fixture(scope="module")
+def treloar() -> list[HomogeneousTest]:
+    if not DATA.is_dir():
+        pytest.skip("Treloar's published data is not there")
+    return [load_test(DATA / f"treloar1944_{kind}.csv") for kind in ("uniaxial", "equibiaxial", "pure_shear")]
+
+
+@pytest.fixture(scope="module")
+def kawabata() -> HomogeneousTest:
+    if not DATA.is_dir():
+        pytest.skip("Kawabata's published data is not there")
+    return load_test(DATA / "kawabata1981_biaxial.csv")
+
+
+def sheet(kind: str, l1: list[float], l2: list[float]) -> HomogeneousTest:
+    first = np.array(l1)
+    return HomogeneousTest(kind, kind, first, np.array(l2), np.zeros_like(first), np.full_like(first, np.nan))
+
+
+def test_stress_of_a_neo_hookean_sheet_in_closed_form() -> None:
+    stretch = np.array([1.0, 1.3, 2.0, 0.7])
+    for l2, expected in (
+        (stretch**-0.5, stretch - stretch**-2),
+        (stretch, stretch - stretch**-5),
+        (np.ones(4), stretch - stretch**-3),
+    ):
+        test = sheet("x", list(stretch), list(l2))
+        np.testing.assert_allclose(nominal_stress((1e5,), (2.0,), test), 1e5 * expected, atol=1e-8)
+
+
+def test_published_parameters_explain_the_published_data(treloar: list[HomogeneousTest]) -> None:
+    found = [r_squared(*OGDEN_1972, test) for test in treloar]
+    assert found == pytest.approx([0.974, 0.997, 0.998], abs=6e-4)
+
+
+def test_joint_fit_of_treloars_data(treloar: list[HomogeneousTest], kawabata: HomogeneousTest) -> None:
+    fit = fit_tests(treloar, terms=3, predict=[kawabata])
+    assert fit.r_squared["treloar1944_uniaxial"] >= 0.996
+    assert fit.r_squared["treloar1944_equibiaxial"] >= 0.998
+    assert fit.r_squared["treloar1944_pure_shear"] >= 0.998
+    assert fit.prediction["kawabata1981_biaxial"] > 0.95  # another rubber, another laboratory, two directions
+    assert fit.others == []
+    assert fit.quantities["G"].verdict == "identified"
+
+
+def test_joint_fit_with_relative_weights_lands_near_the_published_set(treloar: list[HomogeneousTest]) -> None:
+    fit = fit_tests(treloar, terms=3, weighting="relative")
+    assert fit.mu == pytest.approx((-0.00711e6, 0.647e6, 0.00109e6), rel=0.05)
+    assert fit.alpha == pytest.approx((-2.158, 1.243, 5.106), rel=0.01)
+
+
+def test_uniaxial_data_alone_are_called_insufficient(treloar: list[HomogeneousTest]) -> None:
+    """The best fit to them predicts equibiaxial data absurdly, and other sets fit as well."""
+    fit = cross_prediction(treloar[:2], terms=3, starts=12)["treloar1944_uniaxial"]
+    assert fit.r_squared["treloar1944_uniaxial"] > 0.998
+    assert fit.prediction["treloar1944_equibiaxial"] < 0.5
+    assert fit.others
+    assert any("fit as well" in warning for warning in fit.warnings)
+    assert any("not predicted" in warning for warning in fit.warnings)
+    assert any("not determined" in warning and "mu1" in warning for warning in fit.warnings)
+
+
+def test_biaxial_table_is_fitted_with_its_residuals(kawabata: HomogeneousTest) -> None:
+    fit = fit_tests([kawabata], terms=2, starts=6)
+    assert fit.r_squared["kawabata1981_biaxial"] > 0.998
+    residuals = np.array(fit.residuals["kawabata1981_biaxial"])
+    assert residuals.size == kawabata.measured.size
+    assert np.abs(residuals).max() < 0.1 * kawabata.measured.max()
+
+
+def test_known_terms_are_recovered_within_their_stated_uncertainty() -> None:
+    random = np.random.default_rng(5)
+    l1, l2 = (np.ravel(x) for x in np.meshgrid(np.linspace(1.05, 3.0, 14), np.linspace(1.0, 2.5, 9)))
+    exact = HomogeneousTest("known", "biaxial", l1, l2, np.zeros_like(l1), np.zeros_like(l1))
+    stress = nominal_stress((5e3, 3.5e4), (2.5, 5.6), exact)
+    stress *= 1.0 + 0.01 * random.standard_normal(stress.size)
+    noisy = HomogeneousTest("known", "biaxial", l1, l2, *np.split(stress, 2))
+    fit = fit_tests([noisy], terms=2, starts=8, weighting="relative")
+    for name, truth in (("mu1", 5e3), ("mu2", 3.5e4), ("alpha1", 2.5), ("alpha2", 5.6), ("G", 104_250.0)):
+        quantity = fit.quantities[name]
+        assert abs(quantity.value - truth) < 3.5 * quantity.uncertainty, name
+    assert fit.quantities["alpha2"].relative < 0.05
+
+
+def test_analytic_jacobian_against_finite_differences(treloar: list[HomogeneousTest]) -> None:
+    problem = _TestsProblem(treloar, 3, "balanced")
+    x = np.array([0.02, 0.9, 0.1, -1.7, 1.4, 4.6])
+    jacobian = problem.jacobian(x)
+    for k in range(6):
+        step = np.zeros(6)
+        step[k] = 1e-6
+        numeric = (problem.residual(x + step) - problem.residual(x - step)) / 2e-6
+        np.testing.assert_allclose(jacobian[:, k], numeric, rtol=1e-6, atol=1e-8 * np.abs(jacobian[:, k]).max())
+
+
+def test_json_is_plain(treloar: list[HomogeneousTest]) -> None:
+    fit = fit_tests(treloar, terms=1, starts=2)
+    assert json.loads(fit.to_json()) == json.loads(json.dumps(fit.to_dict()))
+
+
+GOOD = "# kind: uniaxial\nstretch,nominal_stress_kPa\n1.1,20\n1.2,40\n1.3,60\n"
+
+
+def test_units_and_kind_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "film.csv"
+    path.write_text(GOOD)
+    test = load_test(path)
+    assert test.kind == "uniaxial"
+    assert test.stress1.tolist() == [20e3, 40e3, 60e3]
+    assert test.stretch2 == pytest.approx(test.stretch1**-0.5)
+
+
+def test_kind_is_read_from_the_published_files(treloar: list[HomogeneousTest], kawabata: HomogeneousTest) -> None:
+    assert [test.kind for test in (*treloar, kawabata)] == ["uniaxial", "equibiaxial", "pure shear", "biaxial"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("# kind: uniaxial\n", "", "what kind of test"),
+        ("uniaxial", "torsion", "allowed are"),
+        ("_kPa", "", "no unit"),
+        ("_kPa", "_psi", "no unit"),
+        ("1.2,40", "1.2", "has 1 values and the heading 2"),
+        ("1.2,40", "1,2,40,0", "decimals have a point"),
+        ("1.2,40", "1.2,forty", "not a number"),
+        ("1.2,40", "1.2,nan", "not finite"),
+        ("1.2,40", "-1.2,40", "not positive"),
+        ("stretch,", "strain,", "the columns are"),
+        ("1.2,40\n1.3,60\n", "", "at least two rows"),
+    ],
+)
+def test_bad_files_are_named_with_what_is_wrong(tmp_path: Path, old: str, new: str, words: str) -> None:
+    path = tmp_path / "film.csv"
+    assert old in GOOD
+    path.write_text(GOOD.replace(old, new, 1))
+    with pytest.raises(TestsError, match=r"film\.csv") as caught:
+        load_test(path)
+    assert words in str(caught.value)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(TestsError, match="cannot read"):
+        load_test(tmp_path / "none.csv")
+    binary = tmp_path / "uniaxial.csv"
+    binary.write_bytes(b"\x89MCAP0\r\n\xff\xfe")
+    with pytest.raises(TestsError, match="not a text file"):
+        load_test(binary)
+
+
+def test_too_few_data_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "film.csv"
+    path.write_text(GOOD)
+    with pytest.raises(TestsError, match="cannot determine"):
+        fit_tests([load_test(path)], terms=2)
+
+
+def test_stresses_that_nothing_can_be_fitted_to_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "flat.csv"
+    rows = [1.1, 1.2, 1.3, 1.4, 1.5]
+    for stresses, words in (
+        ([7.0] * 5, "all stresses are 7000 Pa"),
+        ([-k for k in rows], "tension has to be positive"),
+    ):
+        path.write_text(
+            "# kind: uniaxial\nstretch,nominal_stress_kPa\n"
+            + "".join(f"{stretch},{stress}\n" for stretch, stress in zip(rows, stresses, strict=True))
+        )
+        with pytest.raises(TestsError, match=f"flat: .*{words}"):
+            fit_tests([load_test(path)], terms=1)

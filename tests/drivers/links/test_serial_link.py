@@ -1,0 +1,275 @@
+"""Serial ports, on pseudo-terminals: the real pyserial, the real kernel."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from drivers.links.link import ByteLink, DeviceError, DeviceLost
+from drivers.links.serial_link import PortLock, SerialLink
+
+pty = pytest.importorskip("pty", reason="pseudo-terminals are POSIX")
+termios = pytest.importorskip("termios", reason="pseudo-terminals are POSIX")
+
+
+class Pty:
+    def __init__(self) -> None:
+        import tty
+
+        self.master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+
+    def unplug(self) -> None:
+        for fd in (self.master, self._slave):
+            if fd >= 0:
+                os.close(fd)
+        self.master = self._slave = -1
+
+
+@pytest.fixture
+def other_end() -> Iterator[Pty]:
+    end = Pty()
+    yield end
+    end.unplug()
+
+
+@pytest.fixture
+def link(other_end: Pty) -> Iterator[SerialLink]:
+    link = SerialLink("stage", other_end.port, 115200)
+    yield link
+    link.close()
+
+
+@pytest.fixture(autouse=True)
+def own_temporary_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+
+
+def arrived(link: SerialLink, count: int) -> bytes:
+    data, end = b"", time.monotonic() + 5
+    while len(data) < count and time.monotonic() < end:
+        select.select([link.fileno()], [], [], 0.1)
+        data += link.read()
+    return data
+
+
+def test_is_a_byte_link_named_by_its_port(link: SerialLink, other_end: Pty) -> None:
+    as_link: ByteLink = link
+    assert as_link.name == other_end.port
+
+
+def test_bytes_go_both_ways_and_nothing_waits(link: SerialLink, other_end: Pty) -> None:
+    begin = time.monotonic()
+    assert link.read() == b""
+    assert time.monotonic() - begin < 0.05
+    link.write(b"/1 0 00 get pos:2D\n")
+    assert os.read(other_end.master, 100) == b"/1 0 00 get pos:2D\n"
+    every_byte = bytes(range(256)) * 4
+    os.write(other_end.master, every_byte)
+    assert arrived(link, len(every_byte)) == every_byte
+
+
+def test_what_was_set_is_told(link: SerialLink, other_end: Pty) -> None:
+    assert link.settings["port"] == other_end.port
+    assert link.settings["baud"] == "115200"
+    assert link.settings["low_latency"].startswith("not available")  # a pseudo-terminal has no such mode
+
+
+def test_unplugged_is_one_error_at_read_write_and_fileno(link: SerialLink, other_end: Pty) -> None:
+    other_end.unplug()
+    for _ in range(3):
+        with pytest.raises(DeviceLost, match=rf"stage \({other_end.port}\): the port is gone \(reading"):
+            link.read()
+    with pytest.raises(DeviceLost, match=r"gone \(writing"):
+        link.write(b"x")
+    link.close()
+    with pytest.raises(DeviceLost):
+        link.read()
+    with pytest.raises(DeviceLost):
+        link.write(b"x")
+    with pytest.raises(DeviceLost):
+        link.fileno()
+    link.close()
+
+
+def test_bytes_that_arrived_before_it_was_unplugged_do_no_harm(link: SerialLink, other_end: Pty) -> None:
+    os.write(other_end.master, b"@01 1 0")
+    other_end.unplug()
+    with pytest.raises(DeviceLost):
+        for _ in range(3):
+            link.read()
+
+
+class Broken:
+    """A port that breaks at one chosen call, in each of the ways that pyserial lets through."""
+
+    def __init__(self, where: str, error: Exception, descriptor: int) -> None:
+        self._where, self._error, self._descriptor = where, error, descriptor
+
+    def _break(self, where: str) -> None:
+        if where == self._where:
+            raise self._error
+
+    @property
+    def in_waiting(self) -> int:
+        self._break("in_waiting")
+        return 3
+
+    def read(self, size: int) -> bytes:
+        self._break("read")
+        return b"abc"
+
+    def fileno(self) -> int:
+        """Asked for on the way to a write."""
+        self._break("write")
+        return self._descriptor
+
+    def close(self) -> None:
+        self._break("close")
+
+
+@pytest.mark.parametrize("where", ["in_waiting", "read", "write"])
+@pytest.mark.parametrize(
+    "error",
+    [
+        serial.SerialException("device reports readiness to read but returned no data"),
+        serial.PortNotOpenError(),
+        OSError(5, "Input/output error"),
+        termios.error(5, "Input/output error"),
+        BrokenPipeError(32, "Broken pipe"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_every_way_to_vanish_at_every_call(link: SerialLink, where: str, error: Exception) -> None:
+    broken: Any = Broken(where, error, link.fileno())
+    real, link._serial = link._serial, broken
+    try:
+        with pytest.raises(DeviceLost):
+            link.write(b"x")
+            link.read()
+    finally:
+        link._serial = real
+
+
+def test_a_system_without_low_latency_mode_opens_its_ports(other_end: Pty, monkeypatch: pytest.MonkeyPatch) -> None:
+    owner = next(kind for kind in serial.Serial.__mro__ if "set_low_latency_mode" in vars(kind))
+    monkeypatch.delattr(owner, "set_low_latency_mode")
+    link = SerialLink("stage", other_end.port, 115200)
+    assert "not available" in link.settings["low_latency"]
+    link.close()
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), termios.error(5, "Input/output error")])
+def test_close_of_a_vanished_port_is_quiet_and_releases_the_lock(
+    link: SerialLink, other_end: Pty, error: Exception
+) -> None:
+    broken: Any = Broken("close", error, link.fileno())
+    real, link._serial = link._serial, broken
+    link.close()
+    real.close()
+    SerialLink("stage", other_end.port, 115200).close()
+
+
+def test_stalled_peer_is_told_instead_of_waited_for(link: SerialLink) -> None:
+    begin = time.monotonic()
+    with pytest.raises(DeviceLost, match="takes no more data"):
+        for _ in range(1000):
+            link.write(b"x" * 1000)
+    assert time.monotonic() - begin < 1.0
+
+
+def test_second_opener_in_this_process_is_refused(link: SerialLink, other_end: Pty) -> None:
+    with pytest.raises(DeviceError, match=f"port {other_end.port} is in use by process {os.getpid()}"):
+        SerialLink("laser", other_end.port, 115200)
+    link.read()  # the first is none the worse
+
+
+def test_other_name_of_the_same_port_is_refused(link: SerialLink, other_end: Pty, tmp_path: Path) -> None:
+    alias = tmp_path / "stage-port"
+    alias.symlink_to(other_end.port)
+    with pytest.raises(DeviceError, match="in use"):
+        SerialLink("laser", str(alias), 115200)
+
+
+def test_port_is_free_again_after_close(other_end: Pty) -> None:
+    for _ in range(3):
+        SerialLink("stage", other_end.port, 115200).close()
+
+
+HOLD = """
+import sys, time
+from drivers.links.serial_link import PortLock
+lock = PortLock("stage", sys.argv[1])
+print("held", flush=True)
+time.sleep(60)
+"""
+
+
+def test_lock_of_another_process_holds_until_it_is_killed(other_end: Pty) -> None:
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, other_end.port], stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+        with pytest.raises(DeviceError, match=f"in use by process {holder.pid}"):
+            SerialLink("stage", other_end.port, 115200)
+    finally:
+        holder.kill()
+        holder.communicate()
+    SerialLink("stage", other_end.port, 115200).close()
+
+
+def test_exclusive_program_without_our_lock_is_noticed(other_end: Pty) -> None:
+    other = serial.Serial(other_end.port, exclusive=True)
+    with pytest.raises(DeviceError, match=f"port {other_end.port} cannot be opened"):
+        SerialLink("stage", other_end.port, 115200)
+    other.close()
+    SerialLink("stage", other_end.port, 115200).close()  # the failed attempt has left no lock
+
+
+def test_lock_file_that_is_a_link_to_elsewhere_is_not_followed(other_end: Pty, tmp_path: Path) -> None:
+    lock = PortLock("stage", other_end.port)
+    lock.release()
+    victim = tmp_path / "victim"
+    victim.write_text("keep me")
+    lock.path.unlink()
+    lock.path.symlink_to(victim)
+    with pytest.raises(DeviceError, match="lock file"):
+        SerialLink("stage", other_end.port, 115200)
+    assert victim.read_text() == "keep me"
+
+
+def test_port_that_does_not_exist_is_told_with_those_that_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.links.serial_link.ports", lambda: ["/dev/ttyUSB0", "/dev/ttyUSB7"])
+    with pytest.raises(DeviceError) as caught:
+        SerialLink("stage", "/dev/ttyUSB99", 115200)
+    assert str(caught.value) == (
+        "stage (/dev/ttyUSB99): port /dev/ttyUSB99 does not exist. Ports on this machine: /dev/ttyUSB0, /dev/ttyUSB7."
+    )
+
+
+def test_machine_without_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.links.serial_link.ports", list)
+    with pytest.raises(DeviceError, match="This machine has no serial port"):
+        SerialLink("stage", "/dev/ttyUSB99", 115200)
+
+
+def test_file_that_is_no_port(tmp_path: Path) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text("x")
+    with pytest.raises(DeviceError, match="cannot be opened"):
+        SerialLink("stage", str(path), 115200)
+
+
+def test_pyserial_is_imported_only_when_a_port_is_opened() -> None:
+    code = "import sys, drivers.links.serial_link; sys.exit('serial' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,114 @@
+"""Cases as plain data: answers in order, bad ones told apart."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from typing import Any
+
+import pytest
+
+from rig.analysis.cases import CaseError, solve_cases
+
+GOOD: dict[str, Any] = {
+    "id": "paper",
+    "a": 4e-3,
+    "b": 20e-3,
+    "thickness": 40e-6,
+    "prestretch": 1.2,
+    "h": 10e-3,
+    "voltage": 0.0,
+    "wrinkling": "plain",
+    "material": {"mu": [5e3, 3.5e4], "alpha": [2.5, 5.6], "eps_r": 1.7},
+}
+
+
+def case(**changes: Any) -> dict[str, Any]:
+    return copy.deepcopy(GOOD) | changes
+
+
+def test_an_answer_has_all_its_keys() -> None:
+    (answer,) = solve_cases([case(tolerance=1e-10)])
+    assert list(answer) == [
+        "id",
+        "status",
+        "F",
+        "error_estimate",
+        "peak_field",
+        "min_hoop_stress",
+        "max_stretch",
+        "iterations",
+    ]
+    assert answer["id"] == "paper"
+    assert answer["status"] == "taut"
+    assert answer["F"] == pytest.approx(0.2156961965381, rel=1e-10)
+
+
+BAD: list[tuple[Any, str]] = [
+    (case(a=30e-3), "disk_radius"),
+    (case(h=math.nan), "h = nan"),
+    (case(voltage=math.inf), "voltage"),
+    (case(thickness=-1.0), "thickness"),
+    (case(h="0.01"), "h must be a number"),
+    (case(h=True), "h must be a number"),
+    (case(h=10**400), "h = 1000"),
+    (case(wrinkling="yes"), "wrinkling"),
+    (case(tolerance=0.0), "tolerance"),
+    (case(hh=1.0), "unknown key 'hh'"),
+    ({k: v for k, v in GOOD.items() if k != "b"}, "lacks the key 'b'"),
+    (case(material={"mu": [1e4], "alpha": [2.0, 3.0], "eps_r": 2.0}), "one of each"),
+    (case(material={"mu": "soft", "alpha": [2.0], "eps_r": 2.0}), "material.mu must be a list"),
+    (case(material={"mu": [-1e4], "alpha": [2.0], "eps_r": 2.0}), "shear modulus"),
+    (case(material=None), "material must be an object"),
+    (7, "the case must be an object"),
+]
+
+
+@pytest.mark.parametrize(("bad", "text"), BAD)
+def test_a_bad_case_is_told_and_spoils_no_neighbour(bad: Any, text: str) -> None:
+    alone = solve_cases([case()])
+    first, middle, last = solve_cases([case(), bad, case()])
+    assert middle["status"] == "invalid"
+    assert text in middle["message"]
+    assert middle["F"] is None
+    for answer in (first, last):
+        assert answer["status"] == "taut"
+        assert answer["F"] == pytest.approx(alone[0]["F"], rel=1e-9)
+
+
+def test_order_is_kept_across_tolerances_and_treatments() -> None:
+    cases = [
+        case(id=i, h=(1 + i) * 1e-3, tolerance=10.0 ** -(6 + i % 3), wrinkling=("plain", "tension_field")[i % 2])
+        for i in range(12)
+    ]
+    answers = solve_cases(cases)
+    assert [answer["id"] for answer in answers] == list(range(12))
+    force = [answer["F"] for answer in answers]
+    assert force == sorted(force)
+
+
+def test_a_state_without_an_answer_says_so_in_valid_json() -> None:
+    answers = solve_cases([case(prestretch=1.0, h=1e-3, voltage=2500.0), case()])
+    assert answers[0]["status"] == "slack"
+    assert answers[0]["F"] is None
+    assert "slack" in answers[0]["message"]
+    assert json.loads(json.dumps(answers, allow_nan=False)) == answers
+
+
+def test_extreme_numbers_never_raise_nor_leave_a_number_without_an_answer() -> None:
+    sizes = (1e-300, 1e-30, 1e-9, 1.0, 1e30, 1e300)
+    cases = [case(**{key: GOOD[key] * size}) for key in ("thickness", "h", "a") for size in sizes]
+    cases += [case(voltage=v) for v in (1e-300, 1e-9, 1e9, 1e300)]
+    for answer in solve_cases(cases):
+        assert answer["status"] in ("taut", "wrinkled", "slack", "unstable", "not_converged", "invalid")
+        assert (answer["F"] is None) == (answer["status"] not in ("taut", "wrinkled"))
+
+
+def test_cases_must_be_a_list() -> None:
+    with pytest.raises(CaseError, match="JSON list"):
+        solve_cases({"id": 1})
+
+
+def test_no_cases_no_answers() -> None:
+    assert solve_cases([]) == []

@@ -1,0 +1,82 @@
+"""A scene, and a command, pay only for what they name: looked at in fresh interpreters, by what they imported."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from rig.bench.bench import simulated_bench
+from rig.scene.scene import load_scene
+from rig.sim.served import ServedBench
+
+FIXTURES = Path(str(files("sim_fixtures")))
+
+HEAVY = ("scipy", "lmfit", "matplotlib", "rerun", "can", "serial", "numpy", "pydantic", "google.protobuf", "mcap")
+
+
+def imported_by(code: str) -> set[str]:
+    """Which of HEAVY a fresh interpreter has loaded after running ``code``."""
+    show = f"import sys\n{code}\nprint(','.join(m for m in {HEAVY!r} if m in sys.modules))"
+    root = Path(__file__).resolve().parents[3]
+    done = subprocess.run(
+        [sys.executable, "-c", show], capture_output=True, text=True, check=True, cwd=root, timeout=60
+    )
+    return set(done.stdout.splitlines()[-1].split(",")) - {""}
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "from click.testing import CliRunner\nfrom rig.cli.app import main\n"
+        "assert CliRunner().invoke(main, ['--help']).exit_code == 0"
+    )
+    assert imported_by(code) == set()
+
+
+def test_the_help_of_each_command_imports_nothing_heavy() -> None:
+    code = (
+        "from click.testing import CliRunner\nfrom rig.cli.app import main\n"
+        "for name in main.commands:\n    assert CliRunner().invoke(main, [name, '--help']).exit_code == 0, name"
+    )
+    assert imported_by(code) == set()
+
+
+def test_checking_a_scene_without_hv_opens_no_door_to_hardware_or_fitting() -> None:
+    code = (
+        "from pathlib import Path\nfrom rig.experiment import prepare\n"
+        "f = Path('sim_fixtures')\nprepare(f / 'scenes/no-hv.toml', f / 'protocols/passive.toml')"
+    )
+    assert imported_by(code) & {"can", "serial", "lmfit", "matplotlib", "rerun"} == set()
+
+
+def test_checking_a_scene_with_hv_starts_no_guard_and_opens_no_bus() -> None:
+    code = (
+        "from pathlib import Path\nfrom rig.experiment import prepare\n"
+        "f = Path('sim_fixtures')\nprepare(f / 'scenes/cone-4mm.toml', f / 'protocols/short.toml')\n"
+        "assert not {'multiprocessing', 'rig.safety.remote', 'rig.safety.process'} & set(sys.modules)"
+    )
+    assert imported_by(code) & {"can", "serial"} == set()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
+def test_a_run_without_hv_on_real_ports_starts_no_guard_and_imports_no_can() -> None:
+    scene, _ = load_scene(FIXTURES / "scenes" / "no-hv.toml")
+    with ServedBench(simulated_bench(scene)) as served:
+        code = (
+            "from pathlib import Path\nfrom rig.scene.scene import load_scene\nfrom rig.bench.bench import Bench\n"
+            f"scene = load_scene(Path({str(FIXTURES / 'scenes' / 'no-hv.toml')!r}))[0]\n"
+            f"bench = Bench(scene.with_ports({dict(served.ports)!r}))\n"
+            "bench.attach(lambda role, way, data, t: None)\n"
+            "while not all(device.ready for device in bench.devices.values()):\n"
+            "    for role in bench.devices: bench.poll(role, bench.clock.now())\n"
+            "    bench.clock.sleep_until(bench.clock.now() + 0.002)\n"
+            "bench.close()\n"
+            "assert bench.guard_process is None\n"
+            "assert not {'multiprocessing', 'rig.safety.remote', 'rig.safety.process'} & set(sys.modules)"
+        )
+        found = imported_by(code)
+    assert "serial" in found and "can" not in found

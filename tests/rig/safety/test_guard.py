@@ -1,0 +1,295 @@
+"""The guard starts safe, arms only a dead supply, checks the pair (displacement, voltage), and latches on faults."""
+
+from __future__ import annotations
+
+import math
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from drivers.roles import HVFlag, HVSample
+from rig.base.errors import FaultError, LimitError
+from rig.safety.guard import Guard, GuardState
+from rig.safety.limits import FilmLimits, Limits
+from rig.scene.scene import load_scene
+
+SCENE, _ = load_scene(Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml")
+OFF = HVFlag(0)
+
+
+class Supply:
+    """Writes down what it is told."""
+
+    measures_current = True
+    busy = False
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, float | None]] = []
+
+    def set_ramp(self, volts_per_second: float) -> None:
+        self.told.append(("set_ramp", volts_per_second))
+
+    def set_current_limit(self, amperes: float) -> None:
+        self.told.append(("set_current_limit", amperes))
+
+    def set_voltage(self, volts: float) -> None:
+        self.told.append(("set_voltage", volts))
+
+    def switch_on(self) -> None:
+        self.told.append(("switch_on", None))
+
+    def switch_off(self) -> None:
+        self.told.append(("switch_off", None))
+
+    def emergency_off(self) -> None:
+        self.told.append(("emergency_off", None))
+
+    @property
+    def words(self) -> list[str]:
+        return [word for word, _ in self.told]
+
+
+def make() -> tuple[Guard, Supply, list[str]]:
+    supply, log = Supply(), []
+    limits = Limits.of(SCENE)
+    film = FilmLimits(SCENE.specimen.specimen(), limits)
+    # Only the commands of the role are needed here.
+    guard = Guard(supply, limits, film, 300.0, lambda word, argument: log.append(word))  # type: ignore[arg-type]
+    return guard, supply, log
+
+
+def sample(voltage: float, flags: HVFlag = OFF, current: float = 0.0, setpoint: float = 1000.0) -> HVSample:
+    return HVSample(0.0, voltage, current, setpoint, flags)
+
+
+def live() -> tuple[Guard, Supply, list[str]]:
+    guard, supply, log = make()
+    guard.on_sample(sample(0.0))
+    guard.on_sample(sample(0.0))
+    guard.arm()
+    guard.request(1000.0, 0.0)
+    return guard, supply, log
+
+
+def test_watching_changes_nothing() -> None:
+    guard, supply, log = make()
+    for voltage in (0.0, 1500.0, math.nan):
+        guard.on_sample(sample(voltage, HVFlag.ON | HVFlag.TRIPPED))
+    assert guard.state is GuardState.SAFE
+    guard.ramp_off("end")
+    guard.kill("end")
+    assert supply.told == [] and log == []
+
+
+@pytest.mark.parametrize(
+    ("samples", "words"),
+    [
+        ([], "not measured"),
+        ([sample(0.0)], "0 V"),
+        ([sample(0.0), sample(math.nan)], "nan"),
+        ([sample(0.0), sample(1500.0)], "1500 V"),
+        ([sample(0.0, HVFlag.ON)] * 2, "on already"),
+        ([sample(0.0, HVFlag.INTERLOCK_OPEN)] * 2, "interlock open"),
+    ],
+)
+def test_a_supply_that_is_not_measurably_off_is_not_armed_and_left_alone(samples: list[HVSample], words: str) -> None:
+    guard, supply, _ = make()
+    for one in samples:
+        guard.on_sample(one)
+    with pytest.raises(FaultError, match=words):
+        guard.arm()
+    assert supply.told == []
+    with pytest.raises(FaultError, match="latched"):
+        guard.request(100.0, 0.0)
+    assert supply.told == []
+
+
+def test_the_set_point_is_written_before_the_output_is_switched_on_and_logged_before_either() -> None:
+    _, supply, log = live()
+    assert supply.words == ["set_ramp", "set_current_limit", "set_voltage", "switch_on"]
+    assert log == ["arm", "set_voltage", "switch_on"]
+
+
+@pytest.mark.parametrize("volts", [-1.0, 1801.0, math.nan, math.inf])
+def test_a_voltage_outside_its_limit_is_refused(volts: float) -> None:
+    guard, supply, _ = live()
+    before = list(supply.told)
+    with pytest.raises(LimitError, match="voltage"):
+        guard.request(volts, 0.0)
+    assert supply.told == before
+
+
+def test_a_voltage_that_the_flat_film_bears_is_refused_on_the_stretched_one() -> None:
+    guard, supply, _ = live()
+    guard.request(1500.0, 0.0)
+    before = list(supply.told)
+    with pytest.raises(LimitError, match="field"):
+        guard.request(1500.0, 0.0125)
+    with pytest.raises(LimitError):
+        guard.request(1500.0, math.nan)
+    assert supply.told == before
+
+
+def test_a_path_is_checked_along_its_way() -> None:
+    limits = Limits.of(SCENE)
+    film = FilmLimits(SCENE.specimen.specimen(), limits)
+    film.check_path(0.0, 0.011, 1500.0)
+    with pytest.raises(LimitError, match="field"):
+        film.check_path(0.0, 0.0125, 1500.0)
+    with pytest.raises(LimitError, match="not a number"):
+        film.check_path(0.0, math.nan, 0.0)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        sample(2000.0),
+        sample(math.nan),
+        sample(1000.0, current=60e-6),
+        sample(1000.0, current=math.nan),
+        sample(1000.0, HVFlag.ON | HVFlag.TRIPPED),
+        sample(1000.0, HVFlag.ARC),
+    ],
+)
+def test_a_bad_measurement_while_live_is_an_error_and_the_latch_holds(bad: HVSample) -> None:
+    guard, supply, _ = live()
+    with pytest.raises((LimitError, FaultError)):
+        guard.on_sample(bad)
+    guard.kill("test")
+    assert supply.words[-1] == "emergency_off"
+    with pytest.raises(FaultError, match="latched safe"):
+        guard.request(0.0, 0.0)
+    assert supply.words[-1] == "emergency_off"
+
+
+def test_a_supply_that_does_not_measure_current_is_held_to_its_voltage_only() -> None:
+    guard, supply, _ = make()
+    supply.measures_current = False
+    guard.on_sample(sample(0.0, current=math.nan))
+    guard.on_sample(sample(0.0, current=math.nan))
+    guard.arm()
+    guard.request(1000.0, 0.0)
+    assert supply.words == ["set_ramp", "set_voltage", "switch_on"]
+    guard.on_sample(sample(1000.0, HVFlag.ON, current=math.nan))
+    with pytest.raises(LimitError, match="voltage"):
+        guard.on_sample(sample(2000.0, HVFlag.ON, current=math.nan))
+
+
+def test_a_channel_that_goes_off_by_itself_is_a_fault() -> None:
+    guard, _, _ = live()
+    guard.on_sample(sample(0.0))  # on its way
+    guard.on_sample(sample(0.0))
+    guard.on_sample(sample(1000.0, HVFlag.ON))
+    guard.on_sample(sample(600.0))
+    with pytest.raises(FaultError, match="says that it is off"):
+        guard.on_sample(sample(100.0))
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (sample(900.0, HVFlag.ON), "sagged"),
+        (sample(1100.0, HVFlag.ON), "risen"),
+        (sample(1000.0, HVFlag.ON, setpoint=1200.0), "were asked for from here"),
+    ],
+)
+def test_an_output_that_is_not_where_it_was_sent_is_a_fault_at_the_second_sample(bad: HVSample, words: str) -> None:
+    guard, _, _ = live()
+    guard.on_sample(sample(1000.0, HVFlag.ON))
+    guard.on_sample(bad)
+    guard.on_sample(sample(1000.0, HVFlag.ON))
+    guard.on_sample(sample(998.0, HVFlag.ON | HVFlag.RAMPING))  # on its way
+    guard.on_sample(bad)
+    with pytest.raises(FaultError, match=words):
+        guard.on_sample(bad)
+
+
+def test_an_output_that_ramps_away_from_its_set_point_is_a_fault_at_the_second_sample() -> None:
+    guard, _, _ = live()
+    for voltage in (0.0, 500.0, 1000.0):
+        guard.on_sample(sample(voltage, HVFlag.ON | HVFlag.RAMPING))
+    guard.on_sample(sample(940.0, HVFlag.ON | HVFlag.RAMPING))
+    with pytest.raises(FaultError, match="sagged to 880 V"):
+        guard.on_sample(sample(880.0, HVFlag.ON | HVFlag.RAMPING))
+
+
+def test_off_counts_anew_after_every_command() -> None:
+    guard, _, _ = live()
+    assert not guard.output_is_safe  # though it was measured off twice before it was armed
+    guard.on_sample(sample(10.0))
+    guard.on_sample(sample(10.0))
+    guard.kill("test")
+    assert not guard.output_is_safe
+
+
+def test_off_is_believed_only_when_measured_twice() -> None:
+    guard, _, _ = live()
+    guard.ramp_off("end")
+    for voltage, safe in [(900.0, False), (30.0, False), (math.nan, False), (30.0, False), (10.0, True), (70.0, False)]:
+        guard.on_sample(sample(voltage))
+        assert guard.output_is_safe is safe
+
+
+def test_a_low_voltage_is_not_off_while_the_channel_is_on_a_ramp_is_under_way_or_the_voltage_rises() -> None:
+    guard, _, _ = live()
+    guard.ramp_off("end")
+    ramping = HVFlag.RAMPING
+    story = [(5.0, HVFlag.ON), (5.0, HVFlag.ON), (9.0, HVFlag.ON | ramping), (50.0, ramping), (20.0, ramping)]
+    for voltage, flags in [*story, (0.0, OFF), (10.0, OFF), (20.0, OFF), (20.0, OFF)]:
+        guard.on_sample(sample(voltage, flags))
+        assert not guard.output_is_safe
+    guard.on_sample(sample(20.0))
+    assert guard.output_is_safe
+
+
+def at(
+    t: float, voltage: float, flags: HVFlag = HVFlag.ON, current: float = 5e-8, setpoint: float = 1000.0
+) -> HVSample:
+    return HVSample(t, voltage, current, setpoint, flags)
+
+
+def test_a_monitor_that_shows_the_very_same_for_too_long_is_frozen() -> None:
+    guard, _, _ = live()
+    for number in range(24):
+        guard.on_sample(at(0.1 * number, 999.5))
+    guard.on_sample(at(2.4, 999.625))  # one that differs, and it counts anew
+    for number in range(25, 48):
+        guard.on_sample(at(0.1 * number, 999.5))
+    for number in range(48, 72):
+        guard.on_sample(at(0.1 * number, 999.5, current=1e-9 * number))  # the current shows that it measures
+    with pytest.raises(FaultError, match=r"same 999\.5 V for 2\.40 s; it is frozen"):
+        for number in range(72, 98):
+            guard.on_sample(at(0.1 * number, 999.5, current=3e-8))
+
+
+def test_a_voltage_in_whole_volts_without_a_current_may_rightly_stand_still() -> None:
+    guard, supply, _ = live()
+    supply.measures_current = False
+    for number in range(200):
+        guard.on_sample(at(0.1 * number, 1000.0, current=math.nan))
+    # ... for long, and then a ramp begins
+    guard.request(100.0, 0.0)
+    guard.on_sample(at(20.0, 1000.0, HVFlag.ON | HVFlag.RAMPING, math.nan, 900.0))
+    guard.on_sample(at(20.1, 1000.0, HVFlag.ON | HVFlag.RAMPING, math.nan, 870.0))
+    guard.on_sample(at(20.2, 930.0, HVFlag.ON | HVFlag.RAMPING, math.nan, 840.0))
+
+
+@pytest.mark.parametrize("orderly", [False, True])
+def test_a_monitor_that_does_not_move_with_the_ramp_is_frozen(orderly: bool) -> None:
+    guard, _, _ = live()
+    guard.on_sample(at(0.0, 1000.0))
+    if orderly:
+        guard.ramp_off("end")  # the latch is SAFE, and the voltage is still there
+    else:
+        guard.request(100.0, 0.0)
+    ramping = HVFlag.ON | HVFlag.RAMPING
+    with pytest.raises(FaultError, match=r"same 1000 V for 0\.\d\d s of a ramp; it is frozen"):
+        for number in range(1, 8):
+            guard.on_sample(at(0.1 * number, 1000.0, ramping, 1e-8 * number))
+
+
+def test_a_ramp_that_moves_however_slowly_is_none_that_is_frozen() -> None:
+    guard, _, _ = live()
+    for number in range(100):
+        guard.on_sample(at(0.1 * number, 500.0 + number // 2, HVFlag.ON | HVFlag.RAMPING))
