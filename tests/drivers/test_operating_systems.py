@@ -150,7 +150,9 @@ def windows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(serial, "Serial", Port)
     monkeypatch.setattr(serial.tools.list_ports, "comports", list)
-    spec = importlib.util.spec_from_file_location("serial_link_on_windows", ROOT / "drivers" / "links" / "serial_link.py")
+    spec = importlib.util.spec_from_file_location(
+        "serial_link_on_windows", ROOT / "drivers" / "links" / "serial_link.py"
+    )
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
