@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from model.material.ogden import Array
+from model.arrays import Array
 from model.membrane.solve import Status, Wrinkling, solve_many
 from model.specimen import Specimen
 

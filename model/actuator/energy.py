@@ -14,7 +14,7 @@ import numpy as np
 
 from model.actuator.equilibrium import Actuator
 from model.actuator.stroke import balancing, clenshaw_curtis, quadrature
-from model.material.ogden import Array
+from model.arrays import Array
 from model.membrane.solve import Wrinkling, solve
 from model.specimen import Specimen
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from model.actuator.bias import Bias, forces
 from model.actuator.roots import bracketed
-from model.material.ogden import Array
+from model.arrays import Array
 from model.membrane.solve import Solutions, Status, Wrinkling, solve_many
 from model.specimen import Specimen
 

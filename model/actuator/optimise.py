@@ -22,7 +22,7 @@ import numpy as np
 from model.actuator.design import Point
 from model.actuator.sensitivity import changed, gradient, read, strokes_of
 from model.actuator.stroke import Criteria, Strokes
-from model.material.ogden import Array
+from model.arrays import Array
 
 Objective = Literal["stroke", "work"]
 TOLERANCE = 1e-8
@@ -203,7 +203,7 @@ def optimise(
         progress(0.4 + 0.2 * k, f"largest {objective}")
         order = sorted(tried, key=lambda design: -design.counted(objective))
         for design in order[:BEST]:
-            search.climb(objective, np.array(design.shares))
+            search.maximise(objective, np.array(design.shares))
     # Where two limits meet the best is at a kink, where a search may pass it: every design counts that was met.
     for objective in _OBJECTIVES:
         best[objective] = max([*tried, *search.met], key=lambda design: design.counted(objective))
@@ -213,7 +213,7 @@ def optimise(
         progress(0.8 + 0.2 * (k - 1) / max(front, 1), "front")
         least = low + (high - low) * k / (front + 1)
         near = begin + (np.array(best["stroke"].shares) - begin) * k / (front + 1)
-        search.climb("work", near, least=least)
+        search.maximise("work", near, least=least)
     met = [*tried, *search.met]
     return Optimum(best, undominated(met, front + 2), tried, len(tried) + search.solved)
 
@@ -265,7 +265,7 @@ class _Search:
         }
         return replace(here, slope=slope)
 
-    def climb(self, objective: Objective, begin: Array, least: float | None = None) -> None:
+    def maximise(self, objective: Objective, begin: Array, least: float | None = None) -> None:
         """SLSQP from ``begin``, with a stroke of at least ``least``."""
         import scipy.optimize
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from model.material.ogden import Array
+from model.arrays import Array
 
 Function = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
 ROUNDS = 60

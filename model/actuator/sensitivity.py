@@ -17,7 +17,7 @@ from model.actuator.bias import Mass, Spring, forces
 from model.actuator.design import Point, SameFilm, Treatment
 from model.actuator.equilibrium import Balance, balance, films_of, solve_films, weigh
 from model.actuator.stroke import Criteria, Limit, Strokes, quadrature, strokes
-from model.material.ogden import Array
+from model.arrays import Array
 from model.membrane.solve import Solutions, solve_many
 from model.specimen import Specimen
 

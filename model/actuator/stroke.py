@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from model.actuator.bias import forces
 from model.actuator.equilibrium import Actuator, Balance, balance, films_of, kind_of, solve_films, weigh
 from model.actuator.roots import bracketed, enclosed
-from model.material.ogden import Array
+from model.arrays import Array
 from model.membrane.solve import Solutions, Status, Wrinkling
 from model.stability.limits import slack_voltage
 

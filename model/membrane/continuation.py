@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.material.ogden import Array
-from model.membrane import refinement as ladder
-from model.membrane import ritz, tension_field
+from model.arrays import Array
+from model.membrane import refinement, ritz, tension_field
 from model.membrane.refinement import Iterate
 from model.membrane.ritz import Grid, Problem, State
 
@@ -63,7 +62,9 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
     states = len(problem.span)
     everyone = np.arange(states)
     grid = Grid.lay(modes, problem.cut())
-    correct: Callable[[Problem, Grid, State, float, int], Iterate] = tension_field.search if relaxed else ladder.newton
+    correct: Callable[[Problem, Grid, State, float, int], Iterate] = (
+        tension_field.search if relaxed else refinement.newton
+    )
 
     def first(part: Problem, laid: Grid) -> State:
         return tension_field.guess(part, laid) if relaxed else ritz.careful_guess(part, laid)

@@ -9,7 +9,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from model.material.ogden import Array, relax, stack, stress
+from model.arrays import Array
+from model.material.law import relax, stack, stress
 from model.membrane.ritz import Grid, Index, Points, Problem, State, barycentric, table
 
 FINE = 33  # points of an element where an extreme inside the film is looked for

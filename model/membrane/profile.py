@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from model.material.ogden import Array, relax, stack, stress
+from model.arrays import Array
+from model.material.law import relax, stack, stress
 from model.membrane import ritz
 from model.membrane.output import edges
 from model.membrane.ritz import Grid, Problem, State

@@ -1,4 +1,4 @@
-"""Newton on a ladder of resolutions: the answer, and an estimate of its error from one rung to the next."""
+"""Newton at increasing resolution: the answer, and an estimate of its error from one resolution to the next."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from model.material.ogden import Array
+from model.arrays import Array
 from model.membrane import ritz
 from model.membrane.output import Derivatives, Extremes, derivatives, extremes
 from model.membrane.ritz import Grid, Problem, State
@@ -18,14 +18,16 @@ from model.membrane.ritz import Grid, Problem, State
 MOST_MODES = 64
 FIRST_MODES = 36  # the most to begin with
 MOST_STEPS = 25
-# Newton's step leaves an error of about the square of its relative size; a rung's change of the force is the error of
-# the rung below it, some times the error of the rung itself. Both factors are held to the truth by tests.
+# Newton's step leaves an error of about the square of its relative size; the change of the force from one resolution to
+# the next is the error of the coarser one, some times the error of the finer. Tests hold both factors to the truth.
 NEWTON_FACTOR = 0.3
-RUNG_FACTOR = 0.5
+LEVEL_FACTOR = 0.5
 ROUND_OFF = 1e-13
-FOLDED = -1e-2  # of the meridional stress: a hoop stress below it will not turn out positive on a finer rung
-FLAT = -1e-9  # of the meridional stress: a hoop stress between it and zero is round-off
-LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two rungs may agree by chance
+# Of the meridional stress. A hoop stress below the first will not turn out positive at a finer resolution; one between
+# the second and zero is round-off.
+CLEARLY_NEGATIVE = -1e-2
+ROUND_OFF_TENSION = -1e-9
+LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two resolutions may agree by chance
 
 
 @dataclass(slots=True)
@@ -73,13 +75,13 @@ Number = TypeVar("Number", float, Array)
 
 
 def estimate(lam: Number, previous: Number, change: Number, tail: Number, tolerance: float) -> Number:
-    """Estimated relative error of ``lam``, after ``previous`` on the rung below; nan when there is none."""
-    rung = RUNG_FACTOR * abs((lam - previous) / lam)
-    return rung + NEWTON_FACTOR * change**2 + tail + (ROUND_OFF + LEAST_SHARE * tolerance)
+    """Estimated relative error of ``lam``, after ``previous`` at the resolution before; nan when there is none."""
+    refined = LEVEL_FACTOR * abs((lam - previous) / lam)
+    return refined + NEWTON_FACTOR * change**2 + tail + (ROUND_OFF + LEAST_SHARE * tolerance)
 
 
 def next_modes(modes: int) -> int:
-    """The next rung."""
+    """Modes of the next resolution."""
     return min(MOST_MODES, modes + 2 if modes < 8 else math.ceil(1.35 * modes))
 
 
@@ -144,7 +146,7 @@ def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int =
 
 @dataclass(slots=True)
 class Answer:
-    """What one rung of the ladder settles: which states, and everything about them."""
+    """What one resolution settles: which states, and everything about them."""
 
     index: NDArray[np.intp]
     grid: Grid
@@ -181,7 +183,7 @@ class Start:
         return Start(self.grid.take(index), self.state.take(index))
 
 
-def refine(start: Start, problem: Problem, modes: int) -> Start:
+def prolonged(start: Start, problem: Problem, modes: int) -> Start:
     """The same state with more modes."""
     old = start.grid.table
     grid = Grid.lay(modes, start.grid.breaks)
@@ -209,7 +211,7 @@ def refine(start: Start, problem: Problem, modes: int) -> Start:
     )
 
 
-def climb(
+def refine(
     problem: Problem,
     tolerance: float,
     start: Start,
@@ -235,7 +237,7 @@ def climb(
         total[index] += result.steps
         lam, ok = result.lam, result.ok
         if folded is not None and result.hoop is not None:
-            gone = (result.change <= aim) & (result.hoop <= FOLDED)
+            gone = (result.change <= aim) & (result.hoop <= CLEARLY_NEGATIVE)
             if gone.any():
                 folded.append((index[gone], start.take(gone)))
             lost.append(index[~(ok | gone)])
@@ -265,7 +267,7 @@ def climb(
         if len(rest) < len(index):
             problem, index, start, lam = problem.take(rest), index[rest], start.take(rest), lam[rest]
         previous = lam
-        start = refine(start, problem, next_modes(modes))
+        start = prolonged(start, problem, next_modes(modes))
     return answers, np.concatenate(lost), total
 
 

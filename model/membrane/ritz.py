@@ -29,7 +29,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from model.material.ogden import Array, Film, Stress, relax, stack, stress
+from model.arrays import Array
+from model.material.law import Film, Stress, relax, stack, stress
 
 Index = NDArray[np.intp] | NDArray[np.bool_]
 
@@ -412,8 +413,8 @@ def reduce(grid: Grid, w: Array, at: Points) -> Reduced:
     return Reduced(matrix, residual, coupling, give, hg.sum(axis=(0, 1)), hw, kqw, kew, gw, positive)
 
 
-FEW = 8  # below this many states elimination is not vectorised over the states
-SMALL = 8  # below this many unknowns a loop over Python floats beats LAPACK's call
+FEW_STATES = 8  # below this many states elimination is not vectorised over the states
+FEW_UNKNOWNS = 8  # below this many unknowns a loop over Python floats beats LAPACK's call
 
 
 def factor_solve(matrix: Array, rhs: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -422,8 +423,8 @@ def factor_solve(matrix: Array, rhs: Array) -> tuple[Array, NDArray[np.bool_]]:
     Elimination without pivoting, which is stable for those; another matrix gets what it gets.
     """
     n, _, states = matrix.shape
-    if states < FEW:
-        few = _solve_small if n <= SMALL else _solve_large
+    if states < FEW_STATES:
+        few = _solve_small if n <= FEW_UNKNOWNS else _solve_large
         solved = [few(matrix[:, :, s], rhs[:, :, s]) for s in range(states)]
         return np.stack([x for x, _ in solved], axis=2), np.array([positive for _, positive in solved])
     a = np.concatenate((matrix, rhs), axis=1)

@@ -15,16 +15,17 @@ from math import exp, expm1, log1p
 
 import numpy as np
 
-from model.material.ogden import Array, Evaluations
-from model.membrane import refinement as ladder
-from model.membrane import ritz, tension_field
-from model.membrane import wrinkled_cone as cone
+from model.arrays import Array
+from model.material.law import Evaluations
+from model.membrane import refinement, ritz, tension_field, wrinkled_cone
 from model.membrane.scalar_output import found
-from model.membrane.scalar_state import Cone, Film, Floats, Found, Panel, Stray, places, stress, tables_of
+from model.membrane.scalar_state import Cone, Film, Floats, Found, NotOrdinary, Panel, places, stress, tables_of
 
 MOST_MODES = 12
 MOST_STEPS = 8
-WILD = 20.0
+# Largest relative change of a slope in one step; a larger one is left to the methods that shorten steps.
+LARGEST_CHANGE = 0.8
+LARGEST_CHANGE_WRINKLED = 20.0
 
 
 @dataclass(slots=True)
@@ -145,7 +146,7 @@ class Solver:
         cut = bool(self.cones)
         n = len(c) if cut else 0  # without cuts the only element brings its own
         system = _System([[0.0] * (i + 1) for i in range(n)], [0.0] * n, [0.0] * n)
-        self.stable, self.rest, self.top = True, 1.0, -math.inf
+        self.stable, self.maxwell_share, self.top = True, 1.0, -math.inf
         strips = [self.strip(panel, system) for panel in self.panels]
         springs = [self.spring(fold, system) for fold in self.cones] if cut else []
         lam0 = (film.height - system.reach) / system.give
@@ -163,7 +164,7 @@ class Solver:
                 stretched, extent = max(stretched, dq), max(extent, reach)
             last, fore = panel.place[modes - 1], panel.place[modes - 2]
             tail += self.c[last] ** 2 * diagonal[last] + 0.1 * self.c[fore] ** 2 * diagonal[fore]
-        largest *= math.sqrt(self.rest)
+        largest *= math.sqrt(self.maxwell_share)
         if cut:
             bent = max(self.bend(fold, spring, dc, lam) for fold, spring in zip(self.cones, springs, strict=True))
             largest = max(largest, stretched / extent, bent)
@@ -252,7 +253,7 @@ class Solver:
                 turns.append((h12 * along, h12 * down, h22 * around))
         panel.tension = tension
         self.top = top
-        self.rest = max(self.rest, rest)
+        self.maxwell_share = max(self.maxwell_share, rest)
         system.give += give
         system.reach += reach
         system.add(panel.place, (tables.assemble @ sums).tolist(), cut)
@@ -274,7 +275,7 @@ class Solver:
             new.append(w + dw)
         panel.w = new
         if min(new) <= 0.0:
-            raise Stray
+            raise NotOrdinary
         for i, (on_q, on_w, on_e) in enumerate(strip.turns):
             de = change_of[i]
             dq = de + change_of[points + i] * dxi
@@ -301,7 +302,7 @@ class Solver:
             h11 += h12 * follow
             stretch = exp(u)
             if h22 <= 0.0 or h11 <= t1:
-                raise Stray
+                raise NotOrdinary
             at.append((t1 / stretch, stretch / (h11 - t1), stretch, change, follow))
         if math.isnan(fold.pull):
             weighted = sum(o * r * x[0] for o, r, x in zip(fold.once, fold.radius, at, strict=True))
@@ -320,7 +321,7 @@ class Solver:
         miss = sum(end * self.c[place] for place, end in own)
         miss -= excess * cos - length * sin * sin / (1.0 + cos)
         if not soft > 0.0:
-            raise Stray
+            raise NotOrdinary
         ratio = skew / soft
         force = pull * cos + miss / soft + ratio * pull * sin
         for place, end in own:
@@ -349,7 +350,7 @@ class Solver:
             fold.u[i] += min(max(du, -0.5), 0.5)
             fold.natural[i] += min(max(wider, -0.5), 0.5)
         fold.cos, fold.sin, fold.pull = h / pull, lam / pull, pull
-        return cone.CURVED * max(largest / size, abs(lam / before - 1.0)) * math.sqrt(spring.share)
+        return wrinkled_cone.CURVED * max(largest / size, abs(lam / before - 1.0)) * math.sqrt(spring.share)
 
     def moved(self) -> tuple[Floats, float]:
         """Breaks moved to where the panels' hoop tension vanishes: `model.membrane.tension_field.moved`."""
@@ -390,10 +391,10 @@ class Solver:
         elements = len(breaks)
         breaks.append(0.0)
         if elements > tension_field.MOST_ZONES or (elements == 1 and not first):
-            raise Stray
-        modes = max(3, ladder.first_modes(max(right - left for left, right in pairwise(breaks)), tolerance))
+            raise NotOrdinary
+        modes = max(3, refinement.first_modes(max(right - left for left, right in pairwise(breaks)), tolerance))
         if modes > MOST_MODES:
-            raise Stray
+            raise NotOrdinary
         strain = np.array(panel.strain)
         e, rise = strain[: t.points], strain[t.points :] * panel.dxi
         new = ritz.table(modes)
@@ -435,15 +436,15 @@ class Solver:
                 if film.field != 0.0:
                     self.count.electric += 1
                 if h22 <= 0.0:
-                    raise Stray
+                    raise NotOrdinary
                 change = -t2 / h22
                 log2 += min(max(change, -0.3), 0.3)
-                if abs(change) <= cone.NEAR:
+                if abs(change) <= wrinkled_cone.NEAR:
                     break
             widths.append(log2)
         return Cone(number, u, widths, across / long, down / long, math.nan, cut)
 
-    def refine(self, modes: int) -> None:
+    def prolong(self, modes: int) -> None:
         """The same state with more modes."""
         carry = ritz.transfer(self.modes, modes)
         taut = tuple(panel.number for panel in self.panels)
@@ -481,7 +482,7 @@ class Solver:
             lnlp = self.film.log_prestretch
             excess = [x + lnlp - natural for x, natural in zip(hoop, fold.natural, strict=True)]
             margins.append((1.0, (fine @ excess).tolist()))
-        bound = tension_field.SLACK * ladder.goal(tolerance) * max(abs(x) for _, values in margins for x in values)
+        bound = tension_field.SLACK * refinement.goal(tolerance) * max(abs(x) for _, values in margins for x in values)
         short = min(right - left for left, right in pairwise(self.breaks)) <= 1e-9 * self.film.span
         return not short and all(sign * x < bound for sign, values in margins for x in values)
 
@@ -538,14 +539,14 @@ def solve(
     if film.span > ritz.LONGEST:
         return None
     try:
-        return _climb(Solver(film, count), tolerance, folds, near)
-    except (Stray, ValueError, OverflowError, ZeroDivisionError):
+        return _refine(Solver(film, count), tolerance, folds, near)
+    except (NotOrdinary, ValueError, OverflowError, ZeroDivisionError):
         return None
 
 
-def _climb(solver: Solver, tolerance: float, folds: bool, near: Found | None) -> Found:
-    goal = ladder.goal(tolerance)
-    modes = max(2, ladder.first_modes(solver.film.span, tolerance))
+def _refine(solver: Solver, tolerance: float, folds: bool, near: Found | None) -> Found:
+    goal = refinement.goal(tolerance)
+    modes = max(2, refinement.first_modes(solver.film.span, tolerance))
     solver.begin(modes, None if near is None or near.cones else near)
     previous = math.nan
     steps = 0
@@ -553,31 +554,31 @@ def _climb(solver: Solver, tolerance: float, folds: bool, near: Found | None) ->
         for _ in range(MOST_STEPS):
             lam, change, tail = solver.step(goal)
             steps += 1
-            if not change <= (WILD if solver.cones else 0.8):
-                raise Stray
+            if not change <= (LARGEST_CHANGE_WRINKLED if solver.cones else LARGEST_CHANGE):
+                raise NotOrdinary
             if change <= goal:
                 break
         else:
-            raise Stray
-        if folds and not solver.cones and min(solver.panels[0].tension) <= ladder.FOLDED * solver.top:
+            raise NotOrdinary
+        if folds and not solver.cones and min(solver.panels[0].tension) <= refinement.CLEARLY_NEGATIVE * solver.top:
             modes = solver.fold(tolerance)
             previous = math.nan
             continue
         if not (solver.stable and lam > 0.0):
-            raise Stray
-        error = ladder.estimate(lam, previous, change, tail, tolerance)
+            raise NotOrdinary
+        error = refinement.estimate(lam, previous, change, tail, tolerance)
         if error <= tolerance:
             answer = found(solver, lam, error, steps)
             if not folds or (solver.cones and solver.admissible(tolerance)):
                 return answer
             if solver.cones:
-                raise Stray
-            if answer.hoop >= ladder.FLAT * answer.meridional:
+                raise NotOrdinary
+            if answer.hoop >= refinement.ROUND_OFF_TENSION * answer.meridional:
                 return answer
             modes = solver.fold(tolerance)
             previous = math.nan
             continue
         previous = lam
-        modes = ladder.next_modes(modes)
-        solver.refine(modes)
-    raise Stray
+        modes = refinement.next_modes(modes)
+        solver.prolong(modes)
+    raise NotOrdinary

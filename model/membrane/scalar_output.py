@@ -8,7 +8,7 @@ from math import exp, log1p
 from typing import TYPE_CHECKING
 
 from model.membrane.output import FINE, POLISH, series
-from model.membrane.scalar_state import Cone, Film, Floats, Found, Panel, Stray, Tables, stress
+from model.membrane.scalar_state import Cone, Film, Floats, Found, NotOrdinary, Panel, Tables, stress
 
 if TYPE_CHECKING:
     from model.membrane.scalar import Solver
@@ -115,7 +115,7 @@ def _edge(film: Film, pull: float, start: float) -> Values:
     else:
         t1, t2, _, _, _, _ = stress(film, log1, lnlp)
     if not abs(log1 - start) < 0.1 + 0.5 * abs(start - lnlp):
-        raise Stray
+        raise NotOrdinary
     return log1 + lnlp, -t2, -t1, log1, lnlp
 
 

@@ -9,9 +9,8 @@ from math import exp, expm1, log1p
 
 import numpy as np
 
-from model.material.ogden import Array
-from model.membrane import output, ritz
-from model.membrane import wrinkled_cone as cone
+from model.arrays import Array
+from model.membrane import output, ritz, wrinkled_cone
 
 Floats = list[float]
 
@@ -93,9 +92,9 @@ class Found:
             return np.array([[getattr(fold, name)] for fold in self.cones])
 
         which = tuple(fold.number for fold in self.cones)
-        folds = cone.Cones(which, points("u"), points("natural"), ends("cos"), ends("sin"), ends("pull"))
+        folds = wrinkled_cone.Cones(which, points("u"), points("natural"), ends("cos"), ends("sin"), ends("pull"))
         taut = tuple(panel.number for panel in self.panels)
-        return grid, cone.whole(grid, ritz.State(c, w), taut, folds)
+        return grid, wrinkled_cone.whole(grid, ritz.State(c, w), taut, folds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +145,7 @@ def places(modes: int, elements: int, taut: tuple[int, ...]) -> list[list[int]]:
 
 
 def stress(film: Film, log1: float, log2: float) -> tuple[float, float, float, float, float, float]:
-    """t1, t2, h11, h12, h22 and the Maxwell stress; see `model.material.ogden`."""
+    """t1, t2, h11, h12, h22 and the Maxwell stress; see `model.material.law`."""
     log3 = -(log1 + log2)
     t1 = t2 = 0.0
     h11 = h22 = 4.0  # sum mu alpha = 2 in units of G
@@ -171,5 +170,5 @@ def slack(film: Film) -> bool:
     return stress(film, log, log)[0] < 0.0
 
 
-class Stray(Exception):
-    """Not a state for this module."""
+class NotOrdinary(Exception):
+    """A state that the scalar solver leaves to the methods for arrays."""

@@ -11,13 +11,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.arrays import Array
+from model.material.law import Evaluations, Film, stack, stress
 from model.material.materials import EPSILON_0
-from model.material.ogden import Array, Evaluations, Film, stack, stress
-from model.membrane import continuation as trace
-from model.membrane import ritz, tension_field
-from model.membrane import scalar as single
+from model.membrane import continuation, ritz, scalar, tension_field
 from model.membrane.profile import Profile, dense, profile
-from model.membrane.refinement import FLAT, Answer, Start, climb, first_modes
+from model.membrane.refinement import ROUND_OFF_TENSION, Answer, Start, first_modes, refine
 from model.membrane.ritz import LONGEST, Grid, Problem, State
 from model.membrane.scalar_state import Film as OneFilm
 from model.membrane.scalar_state import Found, slack
@@ -29,7 +28,7 @@ BLOCK = 1024  # states solved together: their arrays stay in the processor's cac
 # Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
 # followed from rest.
 SOFTENING = 0.35
-TRACE_MODES = 10
+FOLLOW_MODES = 10
 WIDEST = 28.0  # ln(b/a) beyond which the film's R^2 has no place in double precision
 
 
@@ -324,12 +323,12 @@ def _quick(
         height=abs(h) / b,
     )
     count = Evaluations()
-    found = None if near is None else single.solve(film, tolerance, count, folds=folds, near=near)
+    found = None if near is None else scalar.solve(film, tolerance, count, folds=folds, near=near)
     if found is None:
-        found = single.solve(film, tolerance, count, folds=folds)
+        found = scalar.solve(film, tolerance, count, folds=folds)
     if found is None or found.softening > SOFTENING or found.meridional <= 0.0:
         return None
-    wrinkled = bool(found.cones) or found.hoop < FLAT * found.meridional
+    wrinkled = bool(found.cones) or found.hoop < ROUND_OFF_TENSION * found.meridional
     if wrinkled and slack(film):
         return None
     force = 2.0 * math.pi * b * t * shear / lp**2 * found.lam
@@ -517,14 +516,14 @@ class _Block:
         grid = Grid.lay(first_modes(float(problem.span.max()) / (len(breaks) - 1), tolerance), breaks)
         start = Start(grid, ritz.guess(problem, grid))
         folded: list[tuple[NDArray[np.intp], Start]] = []
-        answers, lost, steps = climb(
+        answers, lost, steps = refine(
             problem, tolerance, start, sensitivities=sensitivities, folded=folded if relaxed else None
         )
         doubtful = [] if relaxed else [lost]
         for answer in answers:
             x = answer.extremes
             soft = x.softening > SOFTENING
-            wrinkled = x.hoop < FLAT * x.meridional if relaxed else np.zeros_like(soft)
+            wrinkled = x.hoop < ROUND_OFF_TENSION * x.meridional if relaxed else np.zeros_like(soft)
             doubtful.append(answer.index[soft & ~wrinkled])
             if wrinkled.any():
                 folded.append((answer.index[wrinkled], Start(answer.grid, answer.state).take(wrinkled)))
@@ -564,7 +563,7 @@ class _Block:
     ) -> None:
         """Solve states for which a cold start may have missed, or jumped from, the branch that starts at rest."""
         part = problem.take(some)
-        path = trace.follow(part, TRACE_MODES, relaxed=relaxed)
+        path = continuation.follow(part, FOLLOW_MODES, relaxed=relaxed)
         steps[some] += path.steps
         status = np.where(path.limit, Status.UNSTABLE, Status.NOT_CONVERGED)
         result.status[self.index[index[some]]] = status
@@ -577,7 +576,7 @@ class _Block:
                 here, tolerance, sensitivities=sensitivities, begin=Start(grid, state)
             )
         else:
-            answers, _, spent = climb(here, tolerance, Start(grid, state), sensitivities=sensitivities)
+            answers, _, spent = refine(here, tolerance, Start(grid, state), sensitivities=sensitivities)
         steps[some[good]] += spent
         for answer in answers:
             answer.index = some[good[answer.index]]
@@ -617,7 +616,7 @@ class _Block:
         result.flag["stable"][to] = True
         result.flag["field_exceeded"][to] = result.real["peak_field"][to] > self.strength[where]
         result.flag["stretch_exceeded"][to] = result.real["max_stretch"][to] > self.elongation[where]
-        folded = x.hoop < FLAT * x.meridional
+        folded = x.hoop < ROUND_OFF_TENSION * x.meridional
         if answer.state.relaxed is not None:
             folded |= answer.state.relaxed.any(axis=(0, 1))
         result.status[to] = np.where(folded, Status.WRINKLED, Status.TAUT)

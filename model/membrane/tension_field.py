@@ -17,9 +17,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from model.material.ogden import Array, stack, stress
-from model.membrane import refinement as ladder
-from model.membrane import ritz
+from model.arrays import Array
+from model.material.law import stack, stress
+from model.membrane import refinement, ritz
 from model.membrane.output import FINE, fine_table
 from model.membrane.refinement import Answer, Iterate, Start
 from model.membrane.ritz import Grid, Points, Problem, State
@@ -59,7 +59,7 @@ def search(problem: Problem, grid: Grid, state: State, goal: float = 2e-2, limit
         n += 1
         at = ritz.evaluate(problem, grid, state)
         step = ritz.newton(problem, grid, state, at)
-        new, change = ladder.advance(state, step, at, grid)
+        new, change = refinement.advance(state, step, at, grid)
         assert state.relaxed is not None and state.natural is not None and new.natural is not None
         assert at.law.relief is not None
         # A folded point stays folded while its circle is narrower than its natural width.
@@ -186,7 +186,7 @@ def _settle(
         springs = Springs.of(problem, grid, panels, cones, film.c)
         springs.join(system)
         step = ritz.solve(problem, panels, system)
-        new, change = ladder.advance(film, step, at, panels)
+        new, change = refinement.advance(film, step, at, panels)
         cones, bent = springs.advance(step.dc, step.lam)
         # A cut that moves carries the strains with it: they must have settled as well as the slopes.
         de, dq = panels.strain(step.dc)
@@ -203,7 +203,7 @@ def _settle(
         rest = np.flatnonzero(~done)
         if len(rest) == 0 or int(steps[0]) >= limit or len(rest) <= 0.5 * states:
             break
-    ends = ladder.tail(problem, panels, film, step)
+    ends = refinement.tail(problem, panels, film, step)
     state = whole(grid, film, taut, cones)
     result = Iterate(grid, state, step.lam, change, ends, stable, done & stable & (step.lam > 0.0), steps)
     if len(rest) > 0 and int(steps[0]) < limit:
@@ -258,7 +258,7 @@ def admissible(grid: Grid, state: State) -> NDArray[np.bool_]:
 def solve(
     problem: Problem, tolerance: float, *, sensitivities: bool, begin: Start | None = None
 ) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
-    """Solve states of which some part is wrinkled. Returns what `ladder.climb` does.
+    """Solve states of which some part is wrinkled. Returns what `refinement.refine` does.
 
     ``begin`` is a state of the plain equations, or one with every point taut or wrinkled by itself; found by `search`
     when not given.
@@ -318,9 +318,9 @@ def _round(
                 continue
             film = part.take(of)
             breaks, wrinkled = _cut(film, zone.where[:changes, of], first)
-            modes = max(3, ladder.first_modes(float((breaks[1:] - breaks[:-1]).max()), tolerance))
+            modes = max(3, refinement.first_modes(float((breaks[1:] - breaks[:-1]).max()), tolerance))
             begun = remap(grid.take(of), chosen.take(of), at.log[1][..., of], breaks, modes, wrinkled)
-            done, missed, spent = ladder.climb(film, tolerance, begun, sensitivities=sensitivities, settle=settle)
+            done, missed, spent = refinement.refine(film, tolerance, begun, sensitivities=sensitivities, settle=settle)
             where = index[some[of]]
             lost.append(where[missed])
             steps[where] += spent
@@ -330,7 +330,7 @@ def _round(
                     answer.grid,
                     answer.state,
                     ritz.evaluate(solved, answer.grid, answer.state),
-                    slack=SLACK * ladder.goal(tolerance),
+                    slack=SLACK * refinement.goal(tolerance),
                 )
                 same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
                 answer.index = where[answer.index]

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.material.ogden import Array, Stress, relax, stack, stress
+from model.arrays import Array
+from model.material.law import Stress, relax, stack, stress
 from model.membrane.ritz import Grid, Index, Problem, Reduced, State
 
 NEAR = 1e-2  # of ln(l2): from here Newton on the whole film takes the natural width along

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model.material.ogden import Array, Evaluations, Film
-from model.membrane import refinement as ladder
-from model.membrane import ritz
+from model.arrays import Array
+from model.material.law import Evaluations, Film
+from model.membrane import refinement, ritz
 from model.membrane.ritz import Grid, Problem, State
 from model.specimen import Specimen
 
@@ -233,7 +233,7 @@ def vary_displacement(specimen: Specimen, voltage: float, highest: float, *, poi
 def _follow(path: _Path, first: float, points: int, *, to_limit: bool = False) -> tuple[list[_Point], str]:
     """Points of the branch, at most so many, and why it ends."""
     path.set(first)
-    start = ladder.newton(path.problem, path.grid, ritz.guess(path.problem, path.grid), 1e-9)
+    start = refinement.newton(path.problem, path.grid, ritz.guess(path.problem, path.grid), 1e-9)
     if not start.ok[0]:
         raise ValueError("no stable state where the branch should begin: the film is slack or unstable there")
     c = start.state.c[:, 0]

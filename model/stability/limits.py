@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.material.ogden import Array
+from model.arrays import Array
 from model.membrane.solve import Solutions, Status, Wrinkling, solve_many
 from model.specimen import Specimen
 from model.stability.branches import pull_in

@@ -8,10 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from model.material.law import Evaluations, Film
 from model.material.materials import NAMED
-from model.material.ogden import Evaluations, Film
-from model.membrane import refinement as ladder
-from model.membrane import ritz
+from model.membrane import refinement, ritz
 from model.membrane.ritz import Grid, Problem
 from model.membrane.solve import solve_many
 from model.specimen import Specimen
@@ -38,7 +37,7 @@ def test_error_falls_exponentially_with_the_modes(disk: float, lp: float, h: flo
     errors = []
     for modes in (2, 4, 6, 8):
         grid = Grid.lay(modes, problem.cut())
-        found = ladder.newton(problem, grid, ritz.guess(problem, grid), 1e-10)
+        found = refinement.newton(problem, grid, ritz.guess(problem, grid), 1e-10)
         errors.append(abs(float(unit * found.lam[0]) / truth - 1.0))
     assert all(after < before / 20.0 for before, after in pairwise(errors) if before > 1e-11)
 
@@ -53,7 +52,7 @@ def test_newton_converges_with_the_square() -> None:
     changes = []
     for _ in range(5):
         at = ritz.evaluate(problem, grid, state)
-        state, change = ladder.advance(state, ritz.newton(problem, grid, state, at), at, grid)
+        state, change = refinement.advance(state, ritz.newton(problem, grid, state, at), at, grid)
         changes.append(float(change[0]))
     assert all(after < 10.0 * before**2 for before, after in pairwise(changes[1:]) if after > 1e-12)
     assert changes[-1] < 1e-9

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from model.material.law import Evaluations, Film
 from model.material.materials import EPSILON_0, NAMED, Material
-from model.material.ogden import Evaluations, Film
 from model.membrane import ritz, tension_field
 from model.membrane.ritz import Grid, Problem
 from model.membrane.solve import Status, solve, solve_many
