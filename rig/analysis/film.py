@@ -18,6 +18,7 @@ from calibration.sensors.certificate import Certificate, CertificateError
 from calibration.sheet.sheet_tests import TestsError, TestsFit, fit_tests, load_test
 from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
+from rig.base.outputs import write_text
 from rig.base.toml_file import parse_table
 from rig.experiment import IN_MEMORY
 from rig.log.dataset import CurveErrors, Run, load_run
@@ -202,22 +203,6 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
             )
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file that appears whole or not at all.
-
-    Raises
-    ------
-    ConfigError
-        When it cannot be written.
-    """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}.") from None
 
 
 def identify_tests(tests: Sequence[Path], predict: Sequence[Path], terms: int) -> TestsFit:

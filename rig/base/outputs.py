@@ -25,3 +25,19 @@ def check_new(*paths: Path | None) -> None:
             raise ConfigError(f"{path}: its folder {path.parent} does not exist.")
     if len({path.resolve() for path in wanted}) < len(wanted):
         raise ConfigError(f"{', '.join(map(str, wanted))}: each output needs a file of its own.")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file that appears whole or not at all.
+
+    Raises
+    ------
+    ConfigError
+        When it cannot be written.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}.") from None

@@ -100,7 +100,7 @@ class Run:
 
 
 class Stand:
-    """One served bench and one process that bears engines; runs come one after the other.
+    """One served bench and one process that forks engines; runs come one after the other.
 
     Parameters
     ----------
@@ -120,24 +120,24 @@ class Stand:
         self.protocol.write_text(PROTOCOL.replace("HOLD_S", f"{hold_s:g}"), encoding="utf-8")
         loaded, _ = load_scene(self.scene)
         self.bench = ServedBench(simulated_bench(loaded))
-        self._nursery: subprocess.Popen[bytes] | None = None
+        self._server: subprocess.Popen[bytes] | None = None
         self._buffer = b""
         self._runs: list[Run] = []
 
     def start(self, *, power_cycle: bool = True) -> Run:
         """Start a run, by default after switching the supply off and on; returns once there is an engine."""
-        if self._nursery is None:
-            command = [sys.executable, "-m", "rig.benchmark.nursery", str(self.scene), str(self.protocol)]
+        if self._server is None:
+            command = [sys.executable, "-m", "rig.benchmark.forkserver", str(self.scene), str(self.protocol)]
             with self.words.open("ab") as words:
-                self._nursery = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
+                self._server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
             while self._line() != "ready":
                 pass
         if power_cycle:
             self.bench.power_cycle()
         run = Run(self, self.folder / f"run-{len(self._runs)}.mcap")
-        assert self._nursery.stdin is not None
-        self._nursery.stdin.write(json.dumps({"ports": dict(self.bench.ports), "log": str(run.log)}).encode() + b"\n")
-        self._nursery.stdin.flush()
+        assert self._server.stdin is not None
+        self._server.stdin.write(json.dumps({"ports": dict(self.bench.ports), "log": str(run.log)}).encode() + b"\n")
+        self._server.stdin.flush()
         self._runs.append(run)
         self.wait(lambda: run.engine > 0, "an engine")
         return run
@@ -194,12 +194,12 @@ class Stand:
         return line.decode()
 
     def _read(self, seconds: float) -> None:
-        assert self._nursery is not None and self._nursery.stdout is not None
-        ready, _, _ = select.select([self._nursery.stdout], [], [], seconds)
+        assert self._server is not None and self._server.stdout is not None
+        ready, _, _ = select.select([self._server.stdout], [], [], seconds)
         if ready:
-            data = os.read(self._nursery.stdout.fileno(), 65536)
+            data = os.read(self._server.stdout.fileno(), 65536)
             if not data:
-                raise RigError(f"The process that bears engines has ended: {self.words.read_text()[-2000:]}")
+                raise RigError(f"The process that forks engines has ended: {self.words.read_text()[-2000:]}")
             self._buffer += data
 
     def _listen(self, seconds: float) -> None:
@@ -225,11 +225,11 @@ class Stand:
                 if pid > 0 and run.status is None:
                     with suppress(ProcessLookupError):
                         os.kill(pid, signal.SIGKILL)
-        if self._nursery is not None:
-            assert self._nursery.stdin is not None and self._nursery.stdout is not None
-            self._nursery.stdin.close()
-            self._nursery.wait(PATIENCE_S)
-            self._nursery.stdout.close()
+        if self._server is not None:
+            assert self._server.stdin is not None and self._server.stdout is not None
+            self._server.stdin.close()
+            self._server.wait(PATIENCE_S)
+            self._server.stdout.close()
         self.bench.__exit__(*error)
 
 

@@ -8,68 +8,68 @@ from typing import Any
 
 import click
 
+from rig.cli.files import FOLDER
 
-@click.group()
-def benchmark() -> None:
+
+@click.group("benchmark")
+def command() -> None:
     """Measure: error against run time, stability. Quick by default."""
 
 
-def _benchmark_options(command: Callable[..., None]) -> Callable[..., None]:
-    command = click.option("--full", is_flag=True, help="The whole grid; takes many minutes.")(command)
-    folder = click.Path(path_type=Path, file_okay=False)
-    return click.option("--out", type=folder, default="benchmarks", show_default=True, help="For JSON, CSV, PNG.")(
-        command
-    )
+def _options(measured: Callable[..., None]) -> Callable[..., None]:
+    full = click.option("--full", is_flag=True, help="The whole grid; takes many minutes.")
+    out = click.option("--out", type=FOLDER, default="benchmarks", show_default=True, help="For JSON, CSV, PNG.")
+    return out(full(measured))
 
 
-@benchmark.command("solver")
-@_benchmark_options
-def benchmark_solver(full: bool, out: Path) -> None:
+@command.command("solver")
+@_options
+def _solver(full: bool, out: Path) -> None:
     """Error of the membrane solver and of other methods against their run time."""
     from rig.benchmark import solver
 
     _benchmark(solver.run, solver.render, "solver", full, out)
 
 
-@benchmark.command("extremes")
-@_benchmark_options
-def benchmark_extremes(full: bool, out: Path) -> None:
+@command.command("extremes")
+@_options
+def _extremes(full: bool, out: Path) -> None:
     """The solver in extreme states: statuses, and true error against the error it states."""
     from rig.benchmark import extremes
 
     _benchmark(extremes.run, extremes.render, "extremes", full, out)
 
 
-@benchmark.command("fit")
-@_benchmark_options
-def benchmark_fit(full: bool, out: Path) -> None:
+@command.command("fit")
+@_options
+def _fit(full: bool, out: Path) -> None:
     """Error of the identified film against compute time and against the time of the rig."""
     from rig.benchmark import fit
 
     _benchmark(fit.run, fit.render, "fit", full, out)
 
 
-@benchmark.command("rates")
-@_benchmark_options
-def benchmark_rates(full: bool, out: Path) -> None:
+@command.command("rates")
+@_options
+def _rates(full: bool, out: Path) -> None:
     """Samples lost and processor used with all serial drivers on pseudo-terminals, force at 1 kHz."""
     from rig.benchmark import rates
 
     _benchmark(rates.run, rates.render, "rates", full, out)
 
 
-@benchmark.command("log")
-@_benchmark_options
-def benchmark_log(full: bool, out: Path) -> None:
-    """Messages written a second, time to load ten minutes at 1 kHz, the disk's patience, cost of damaged logs."""
+@command.command("log")
+@_options
+def _log(full: bool, out: Path) -> None:
+    """Messages written a second, time to load ten minutes at 1 kHz, how long the disk takes, cost of damaged logs."""
     from rig.benchmark import log
 
     _benchmark(log.run, log.render, "log", full, out)
 
 
-@benchmark.command("safety")
-@_benchmark_options
-def benchmark_safety(full: bool, out: Path) -> None:
+@command.command("safety")
+@_options
+def _safety(full: bool, out: Path) -> None:
     """How soon the voltage is off when the engine or the guard is killed or hangs, over real processes."""
     from rig.benchmark import safety
 

@@ -1,22 +1,10 @@
-"""A log in the Rerun viewer: curves over time, the force-displacement loop, the film. Only this module knows Rerun.
+"""A log as a Rerun recording: curves over time, the force-displacement loop, the film.
 
-Rerun recordings are throw-away products of a log; the log stays the record. The viewer is started as a process of
-its own, listens on 127.0.0.1 only, and keeps its settings in a directory that is removed afterwards, so that its
-telemetry is off without touching the operator's own settings.
+Rerun recordings are throw-away products of a log; the log stays the record.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import re
-import shutil
-import socket
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,23 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.membrane.solve import profiles
-from rig.base.clock import RealClock
-from rig.base.errors import ConfigError, RigError
+from rig.base.errors import ConfigError
 from rig.base.toml_file import parse_table
-from rig.log.dataset import Run, load_run
+from rig.log.dataset import Run
 from rig.log.text import printable
 from rig.scene.scene import Scene
 
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
-    from rerun.experimental import ViewerClient
 
     from model.specimen import Specimen
 
 TIMELINE = "run"
-WINDOW = "1600x1000"
-PATIENCE_S = 120.0  # for a picture, on a machine without a graphics card
 
 # Where things are in the recording.
 FORCE, DISPLACEMENT, VOLTAGE, PHASES, LOOP, FILM, EVENTS, ABOUT = (
@@ -66,39 +50,7 @@ FILM_INSTANTS = 50
 RINGS, SECTORS = 24, 72
 
 
-def view(log_path: Path, *, save: Path | None = None, screenshot: Path | None = None) -> None:
-    """Open a log in the viewer, or write a Rerun recording and a picture instead.
-
-    Parameters
-    ----------
-    log_path : Path
-        A log, finished or not.
-    save : Path, optional
-        Write a Rerun recording (``.rrd``) there.
-    screenshot : Path, optional
-        Write a picture (``.png``) there; needs no display, but a Vulkan driver.
-
-    Raises
-    ------
-    rig.log.errors.LogError
-        The log cannot be read.
-    ConfigError, RigError
-        A file cannot be written, there is no display, or the viewer failed.
-    """
-    run = load_run(log_path)
-    with tempfile.TemporaryDirectory(prefix="dea-rig-view-") as name:
-        folder = Path(name)
-        recording = folder / f"{log_path.name.removesuffix('.mcap')}.rrd"
-        _write_recording(run, recording)
-        if screenshot is not None:
-            _take_picture(run, recording, screenshot, folder)
-        if save is not None:
-            _place(recording, save)
-        if save is None and screenshot is None:
-            _open_viewer(recording, folder)
-
-
-def _write_recording(run: Run, path: Path) -> None:
+def write_recording(run: Run, path: Path) -> None:
     import rerun as rr
 
     film = _film(run)
@@ -362,7 +314,7 @@ def _film_rows(run: Run) -> NDArray[np.intp]:
     if not known.size:
         return known
     even = known[np.linspace(0, known.size - 1, FILM_INSTANTS).astype(np.intp)]
-    return np.unique([*even, known[np.argmin(np.abs(run.t[known] - _best_instant(run)))]])
+    return np.unique([*even, known[np.argmin(np.abs(run.t[known] - best_instant(run)))]])
 
 
 def _triangles() -> NDArray[np.uint32]:
@@ -446,53 +398,7 @@ def _ticks(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return ticks
 
 
-def _open_viewer(recording: Path, folder: Path) -> None:
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise RigError("There is no display here. Use --screenshot FILE.png or --save FILE.rrd.")
-    with _viewer(folder, "--port", "auto", str(recording)) as viewer:
-        code = viewer.wait()
-    if code != 0:
-        raise RigError(f"The viewer ended with code {code}. Its last words: {_last_words(folder)}")
-
-
-def _take_picture(run: Run, recording: Path, target: Path, folder: Path) -> None:
-    """Show the recording in a viewer without a window, at the instant of the largest displacement."""
-    from rerun.experimental import ViewerClient
-
-    port = _free_port()
-    arguments = ("--headless", "--hide-welcome-screen", "--window-size", WINDOW, "--port", str(port), str(recording))
-    clock = RealClock()
-    with _viewer(folder, *arguments) as viewer:
-        client = None
-        while client is None or not _shown(client):
-            if viewer.poll() is not None:
-                raise RigError(_why_no_picture(_last_words(folder)))
-            if not clock.now() < PATIENCE_S:
-                raise RigError(
-                    f"The viewer did not show the log within {PATIENCE_S:.0f} s; the machine may be too busy."
-                )
-            clock.sleep_until(clock.now() + 0.2)
-            with suppress(ConnectionError, RuntimeError):
-                client = client or ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-        client.set_time(TIMELINE, duration=_best_instant(run), play_state="paused")
-        clock.sleep_until(clock.now() + 1.0)  # for the views to settle and the viewer's own notices to vanish
-        picture = folder / "picture.png"
-        client.save_screenshot(str(picture))
-        complaints = [report.summary for view in client.get_state().views for report in view.reports]
-    if complaints:
-        raise RigError(f"The viewer could not show everything: {'; '.join(complaints)}")
-    _place(picture, target)
-
-
-def _shown(client: ViewerClient) -> bool:
-    try:
-        state = client.get_state()
-    except (ConnectionError, RuntimeError):
-        return False
-    return bool(state.recordings) and not state.loading
-
-
-def _best_instant(run: Run) -> float:
+def best_instant(run: Run) -> float:
     """When the film is farthest out, at the highest voltage at which that happens."""
     if not np.isfinite(run.h).any():
         return float(run.t[-1])
@@ -501,68 +407,3 @@ def _best_instant(run: Run) -> float:
         far = np.array([np.nanargmax(run.h)])
     voltage = np.nan_to_num(run.voltage[far])
     return float(run.t[far[np.argmax(voltage >= 0.98 * voltage.max())]])
-
-
-@contextmanager
-def _viewer(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """The viewer's own binary as a child process, ended with the block; its messages go to a file in ``folder``."""
-    import rerun_cli
-
-    binary = Path(rerun_cli.__file__).with_name("rerun.exe" if os.name == "nt" else "rerun")
-    settings = folder / "rerun"
-    settings.mkdir(exist_ok=True)
-    telemetry = {
-        "analytics_enabled": False,
-        "analytics_id": "",
-        "metadata": {},
-        "config_file_path": str(settings / "analytics.json"),
-        "data_dir_path": str(settings / "analytics"),
-    }
-    (settings / "analytics.json").write_text(json.dumps(telemetry))
-    environment = {**os.environ, "XDG_CONFIG_HOME": str(folder), "XDG_DATA_HOME": str(folder), "RUST_LOG": "error"}
-    command = [str(binary), "--bind", "127.0.0.1", *arguments]
-    with (folder / "messages.txt").open("wb") as messages:
-        viewer = subprocess.Popen(command, env=environment, stdout=messages, stderr=messages, stdin=subprocess.DEVNULL)
-        try:
-            yield viewer
-        finally:
-            viewer.terminate()
-            try:
-                viewer.wait(10.0)
-            except subprocess.TimeoutExpired:
-                viewer.kill()
-                viewer.wait()
-
-
-def _last_words(folder: Path) -> str:
-    """What the viewer said, from where it gave up if it did, without colours and control characters."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", (folder / "messages.txt").read_text(errors="replace"))
-    panic = text.find("panicked at")
-    words = text[panic:].splitlines()[:2] if panic >= 0 else text.splitlines()[-3:]
-    return printable(" ".join(words))
-
-
-def _why_no_picture(messages: str) -> str:
-    if re.search("adapter|vulkan|wgpu|render", messages, re.IGNORECASE):
-        return (
-            "A picture needs a graphics driver, and this machine offers none. On Debian or Ubuntu a driver that needs "
-            f"no graphics card is installed by: sudo apt install mesa-vulkan-drivers (the viewer said: {messages})"
-        )
-    return f"The viewer ended before the picture was made. Its last words: {messages}"
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    return port
-
-
-def _place(made: Path, target: Path) -> None:
-    """Copy a finished file to where it was asked for; it appears whole or not at all."""
-    part = target.with_name(target.name + ".part")
-    try:
-        shutil.copyfile(made, part)
-        part.replace(target)
-    except OSError as error:
-        raise ConfigError(f"{target}: cannot be written: {error.strerror}.") from None

@@ -119,7 +119,7 @@ def test_engine_gone_on_the_way_to_contact_leaves_the_stage_within_a_leg(
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGUSR1], ids=["stopped", "busy"])
 def test_engine_hung(stand: Stand, live: Run, number: signal.Signals) -> None:
-    """Stopped, or in a loop that never comes back (the nursery's handler of SIGUSR1)."""
+    """Stopped, or in a loop that never comes back (the fork server's handler of SIGUSR1)."""
     at = stand.kill(live.engine, number)
     off_after(stand, at, HUNG_S)
     stays_off(stand, at)

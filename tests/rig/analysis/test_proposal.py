@@ -20,7 +20,7 @@ from rig.analysis.film import identify_logs
 from rig.base.errors import ConfigError, LimitError
 from rig.benchmark.fit import simulated
 from rig.cli.app import main
-from rig.cli.show import proposal_table
+from rig.cli.plan import proposal_table
 from rig.experiment import certificates_of, prepare, run
 from rig.protocol.protocol import Protocol, load_protocol
 from rig.scene.scene import load_scene

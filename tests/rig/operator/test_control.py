@@ -15,7 +15,8 @@ import pytest
 
 from rig.base.errors import ConfigError
 from rig.operator.control import Control, Keyboard, Question
-from rig.operator.remote import LONGEST, MOST, LiveRun, Remote, live_run, run_directory
+from rig.operator.live import LONGEST, LiveRun, live_run, run_directory
+from rig.operator.remote import MOST, Remote
 from rig.operator.signals import stop_on_signals
 
 posix = pytest.mark.skipif(os.name != "posix", reason="terminals and their signals are POSIX")
@@ -168,7 +169,7 @@ def test_of_several_runs_one_has_to_be_named(folder: Path) -> None:
             about = {"pid": pid, "port": hanging.getsockname()[1], "token": "", "log": f"/{pid}.mcap"}
             (folder / f"{pid}.json").write_text(json.dumps(about))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("rig.operator.remote.PATIENCE_S", 0.05)
+            patch.setattr("rig.operator.live.REPLY_S", 0.05)
             with pytest.raises(ConfigError, match="name the log"):
                 live_run()
             with pytest.raises(ConfigError, match="Use the emergency stop"):

@@ -13,7 +13,8 @@ from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
 from rig.view import recording as view_module
-from rig.view.recording import view
+from rig.view import viewer as viewer_module
+from rig.view.viewer import view
 
 HAS_DRIVER = any(
     Path(folder).is_dir() and any(Path(folder).glob("*.json"))
@@ -146,8 +147,8 @@ def test_the_viewer_keeps_to_itself(log, tmp_path):
     folder = tmp_path / "work"
     folder.mkdir()
     clock = RealClock()
-    port = view_module._free_port()
-    with view_module._viewer(folder, "--headless", "--port", str(port)) as viewer:
+    port = viewer_module._free_port()
+    with viewer_module._viewer(folder, "--headless", "--port", str(port)) as viewer:
         listening: set[str] = set()
         while not listening and clock.now() < 30:
             assert viewer.poll() is None
@@ -202,7 +203,7 @@ def test_a_place_that_cannot_be_written(log, tmp_path):
         view(log, save=tmp_path / "missing" / "a.rrd")
 
 
-@pytest.mark.parametrize("module", ["rig.cli.app", "rig.view.recording"])
+@pytest.mark.parametrize("module", ["rig.cli.app", "rig.view.viewer"])
 def test_rerun_is_imported_only_when_a_log_is_viewed(module):
     code = f"import sys, {module}; sys.exit(any(name.split('.')[0].startswith('rerun') for name in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
@@ -221,7 +222,7 @@ def test_rerun_is_imported_only_when_a_log_is_viewed(module):
 def test_the_instant_of_the_picture(h, voltage, when):
     """The farthest displacement, at the highest voltage that was on there."""
     run = SimpleNamespace(t=np.arange(len(h)), h=np.array(h, dtype=float), voltage=np.array(voltage, dtype=float))
-    assert view_module._best_instant(run) == when
+    assert view_module.best_instant(run) == when
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from rig.base.errors import DataError, LimitError
 from rig.base.toml_file import load_table, parse_table
 from rig.calibrate.plan import series
 from rig.cli.app import main
-from rig.cli.show import calibration_table
+from rig.cli.calibrate import calibration_table
 from rig.log.reader import read_log
 from rig.protocol.plan import check_plan, plan
 from rig.protocol.protocol import Protocol

@@ -54,7 +54,7 @@ def serve(experiment: Experiment) -> None:
             for line in lines:
                 pid = os.fork()
                 if pid == 0:
-                    bear(experiment, json.loads(line))
+                    spawn(experiment, json.loads(line))
                 children.add(pid)
                 say(f"engine {pid}")
         for pid in list(children):
@@ -64,7 +64,7 @@ def serve(experiment: Experiment) -> None:
                 say(f"ended {pid} {os.waitstatus_to_exitcode(status)}")
 
 
-def bear(experiment: Experiment, wanted: dict[str, Any]) -> None:
+def spawn(experiment: Experiment, wanted: dict[str, Any]) -> None:
     """The life of one engine; never returns."""
     forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign]  # it is our parent's child
     code = 1

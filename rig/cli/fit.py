@@ -1,0 +1,137 @@
+"""``dea-rig fit``: the film's parameters from logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rig.cli.files import FILE, tell_written
+
+if TYPE_CHECKING:
+    from rich.console import Group, RenderableType
+    from rich.table import Table
+
+    from calibration.film.result import Identification
+
+
+@click.command("fit")
+@click.argument("logs", nargs=-1, required=True, type=FILE)
+@click.option("-o", "--out", type=FILE, help="Result as JSON.")
+@click.option("--report", type=FILE, help="Result as one self-contained HTML page.")
+@click.option("--terms", type=click.IntRange(1, 3), default=2, show_default=True, help="Ogden terms.")
+@click.option("--compare", "comparing", is_flag=True, help="Judge 1, 2 and 3 terms: AICc, BIC, held-out curves.")
+@click.option("--profiles", is_flag=True, help="95 % intervals from profile likelihood too; takes longer.")
+@click.option("--posterior", is_flag=True, help="Markov chains too (extra `posterior`); takes a minute or more.")
+@click.option(
+    "--wrinkled",
+    type=click.Choice(["left-out", "tension-field"]),
+    default="left-out",
+    show_default=True,
+    help="Samples at which the film is wrinkled: leave out, or describe by the tension field. Counted either way.",
+)
+def command(
+    logs: tuple[Path, ...],
+    out: Path | None,
+    report: Path | None,
+    terms: int,
+    comparing: bool,
+    profiles: bool,
+    posterior: bool,
+    wrinkled: str,
+) -> None:
+    """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties."""
+    from rig.analysis.film import identify_logs, write_results
+    from rig.base.outputs import check_new
+    from rig.base.progress import progress
+    from rig.cli.show import show
+
+    check_new(out, report)
+    with progress("Markov chains around the fit") if posterior else nullcontext(lambda *_: None) as update:
+        found = identify_logs(
+            list(logs),
+            terms=terms,
+            comparing=comparing,
+            profiles=profiles,
+            wrinkled=wrinkled,
+            posterior=posterior,
+            progress=update,
+        )
+    write_results(found, out, report)
+    tables = [comparison_table(found.comparison)] if comparing else []
+    tables += [posterior_table(found.identification)] if posterior else []
+    show(identification_table(found.identification), *tables, *(f"note: {note}" for note in found.notes))
+    tell_written(out, report)
+
+
+def identification_table(found: Identification) -> Group:
+    """The identified quantities with their standard uncertainties and verdicts, and what speaks against them."""
+    from rich.console import Group
+
+    from rig.cli.show import NAMES, quantities_table
+
+    table = quantities_table(
+        f"Identified with {found.terms} Ogden terms, {found.used} samples, {found.excluded} left out", found.quantities
+    )
+    lines: list[RenderableType] = [
+        table,
+        f"reduced chi-square {found.reduced_chi_square:.3f} ({found.freedom} degrees of freedom); stiffness is the "
+        f"secant shear modulus at stretches {found.stretch[0]:.2f} (meridional; largest "
+        f"{found.stiffness_curve.meridional_stretch[-1]:.2f}) and {found.stretch[1]:.2f} (hoop).",
+    ]
+    lines += [f"note: {warning}" for warning in found.warnings]
+    lines += [f"advice: {advice}" for advice in found.advice]
+    if found.blind_spots:
+        from calibration.rounding import percent
+
+        worst = found.blind_spots[0]
+        shifts = (
+            f"{NAMES.get(name, name)} by {percent(abs(shift / found.quantities[name].value))}"
+            for name, shift in found.unseen[worst.name].items()
+        )
+        lines.append(
+            f"unseen: {worst.blind} could be there without showing in these data and shift {', '.join(shifts)}. To "
+            f"rule it out: {worst.remedy}. The report lists all {len(found.blind_spots)} that could shift a result by "
+            "more than its uncertainty."
+        )
+    return Group(*lines)
+
+
+def comparison_table(found: Sequence[Identification]) -> Table:
+    """The same data with several numbers of Ogden terms."""
+    from rich.table import Table
+
+    table = Table(title="Ogden terms: smaller criteria are better, differences below 2 mean nothing")
+    for heading in ("terms", "AICc", "BIC", "held out / noise", "not identifiable"):
+        table.add_column(heading, justify="left" if heading == "not identifiable" else "right", overflow="fold")
+    least = [min(getattr(one, name) for one in found) for name in ("aicc", "bic")]
+    for one in found:
+        lost = [name for name, quantity in one.quantities.items() if quantity.verdict.startswith("not")]
+        predicted = ", ".join(f"{part.ratio:.2f}" for part in one.held_out)
+        criteria = (f"{value - low:+.1f}" for value, low in zip((one.aicc, one.bic), least, strict=True))
+        table.add_row(str(one.terms), *criteria, predicted or "-", ", ".join(lost) or "-")
+    return table
+
+
+def posterior_table(found: Identification) -> Table:
+    """What the Markov chains say, beside the fit."""
+    from rich.table import Table
+
+    chains = found.posterior
+    assert chains is not None
+    ended = "" if chains.converged else " TOO SHORT for its autocorrelation: do not rely on it."
+    table = Table(
+        title="Posterior by Markov chains; gains and dimensions held",
+        caption=f"{chains.walkers} walkers, {chains.steps} steps, {chains.acceptance:.0%} accepted, "
+        f"autocorrelation {chains.autocorrelation:.0f} steps.{ended}",
+    )
+    table.add_column("quantity")
+    for heading in ("fit", "mean", "standard deviation", "95 % from", "to"):
+        table.add_column(heading, justify="right")
+    for name, one in chains.quantities.items():
+        numbers = (found.quantities[name].value, one.mean, one.deviation, one.low, one.high)
+        table.add_row(f"{name} / {one.unit}" if one.unit else name, *(f"{value:.5g}" for value in numbers))
+    return table

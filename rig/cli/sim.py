@@ -1,0 +1,35 @@
+"""``dea-rig sim``: the simulated bench behind pseudo-terminals."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import click
+
+from rig.cli.files import FILE
+
+
+@click.command("sim")
+@click.argument("scene", type=FILE)
+def command(scene: Path) -> None:
+    """Serve the simulated bench of SCENE, or the log in its place, on pseudo-terminals; prints the ports as JSON."""
+    from rig.base.clock import RealClock
+    from rig.base.errors import ConfigError
+    from rig.bench.bench import wired_bench
+    from rig.operator.signals import stop_on_signals
+    from rig.scene.scene import load_scene
+
+    if os.name != "posix":
+        raise ConfigError("The bench is served on pseudo-terminals, which this system lacks. Run it in memory.")
+    from rig.sim.server import Server
+
+    loaded, _ = load_scene(scene)
+    server = Server(wired_bench(loaded, real_time=True), RealClock())
+    with stop_on_signals() as stop:
+        try:
+            click.echo(json.dumps(server.ports))
+            server.run(lambda: stop.count > 0)
+        finally:
+            server.close()

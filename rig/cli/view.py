@@ -1,0 +1,23 @@
+"""``dea-rig view``: a log in the Rerun viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from rig.cli.files import FILE, tell_written
+
+
+@click.command("view")
+@click.argument("log", type=FILE)
+@click.option("--save", type=FILE, help="Write a Rerun recording instead of opening the viewer.")
+@click.option("--screenshot", type=FILE, help="Write a picture instead of opening the viewer; needs no display.")
+def command(log: Path, save: Path | None, screenshot: Path | None) -> None:
+    """Open LOG in the Rerun viewer, on this machine only."""
+    from rig.base.outputs import check_new
+    from rig.view.viewer import view
+
+    check_new(save, screenshot)
+    view(log, save=save, screenshot=screenshot)
+    tell_written(save, screenshot)

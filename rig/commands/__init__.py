@@ -1,1 +1,0 @@
-"""What stands behind commands that are more than a few lines."""

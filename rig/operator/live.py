@@ -1,0 +1,117 @@
+"""The side of another terminal: find the run that is going on, and speak to it.
+
+Imports nothing but the standard library and the errors, so that ``dea-rig stop`` acts at once.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rig.base.errors import ConfigError
+
+LONGEST = 1024  # bytes of a request
+REPLY_S = 3.0  # the loop looks twenty times a second, unless it hangs
+
+
+def run_directory() -> Path:
+    """The directory in which this user's live runs are announced; made when it does not exist.
+
+    Raises
+    ------
+    ConfigError
+        When it belongs to somebody else or others may write to it.
+    """
+    import tempfile
+
+    base = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("LOCALAPPDATA")
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(base) / "dea-rig" if base else Path(tempfile.gettempdir()) / f"dea-rig-{user}"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made, so nobody could stop the run from there: {error}.") from None
+    if not stat.S_ISDIR(found.st_mode) or (os.name == "posix" and (found.st_uid != user or found.st_mode & 0o077)):
+        raise ConfigError(f"{folder}: is not a directory that only you may use. Remove it and start again.")
+    return folder
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """A run that somebody may talk to."""
+
+    file: Path
+    pid: int
+    port: int
+    token: str
+    log: str
+
+    def send(self, text: str) -> dict[str, str]:
+        """One request and its reply.
+
+        Raises
+        ------
+        ConnectionError
+            Nobody listens there any more.
+        ConfigError
+            The run does not answer, or its answer is not one.
+        """
+        try:
+            with socket.create_connection(("127.0.0.1", self.port), timeout=REPLY_S) as line:
+                line.sendall(f"{self.token} {' '.join(text.split())}\n".encode())
+                reply = json.loads(b"".join(iter(lambda: line.recv(LONGEST), b"")))
+                return {str(key): str(value) for key, value in reply.items()}
+        except ConnectionError:
+            raise
+        except (OSError, ValueError, AttributeError):
+            raise ConfigError(
+                f"The run of {self.log} (process {self.pid}) does not answer. Use the emergency stop; then end the "
+                f"process: kill {self.pid}"
+            ) from None
+
+    @property
+    def live(self) -> bool:
+        """Whether somebody listens. The announcement of a run that was killed is removed."""
+        try:
+            self.send("status")
+        except ConnectionError:
+            self.file.unlink(missing_ok=True)
+            return False
+        except ConfigError:
+            return True  # it hangs; who wants to stop it must be told
+        return True
+
+
+def live_run(log: Path | None = None) -> LiveRun:
+    """The one run of this user that is going on; ``log`` names it when there are several.
+
+    Raises
+    ------
+    ConfigError
+        When there is none, or it is not clear which one is meant.
+    """
+    runs = [run for file in sorted(run_directory().glob("*.json")) if (run := _announced(file)) and run.live]
+    if log is not None:
+        runs = [run for run in runs if Path(run.log) == log.resolve()]
+    if not runs:
+        raise ConfigError(
+            "No run of yours is going on" + (f" that writes {log}." if log else ".") + " Nothing was done."
+        )
+    if len(runs) > 1:
+        listing = "\n".join(f"  {run.log}" for run in runs)
+        raise ConfigError(f"Several runs are going on; name the log of the one that is meant:\n{listing}")
+    return runs[0]
+
+
+def _announced(file: Path) -> LiveRun | None:
+    try:
+        about: dict[str, Any] = json.loads(file.read_text())
+        return LiveRun(file, int(about["pid"]), int(about["port"]), str(about["token"]), str(about["log"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
