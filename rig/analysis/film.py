@@ -20,7 +20,7 @@ from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
 from rig.base.outputs import write_text
 from rig.base.toml_file import parse_table
-from rig.experiment import IN_MEMORY
+from rig.log.contents import IN_MEMORY
 from rig.log.dataset import CurveErrors, Run, load_run
 from rig.scene.scene import Scene
 

@@ -20,8 +20,8 @@ from model.membrane.solve import Status, solve_many
 from model.specimen import Specimen
 from rig.analysis.film import errors_of
 from rig.base.errors import ConfigError, LimitError
-from rig.experiment import certificates_of
 from rig.protocol import protocol as steps
+from rig.protocol.experiment import certificates_of
 from rig.protocol.plan import check_plan, plan
 from rig.protocol.protocol import Protocol
 from rig.safety.limits import Limits

@@ -28,7 +28,7 @@ from model.material.materials import Material
 from model.membrane.solve import solve_many
 from model.specimen import Specimen
 from rig.analysis import proposal
-from rig.experiment import certificates_of
+from rig.protocol.experiment import certificates_of
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import Scene, load_scene
 

@@ -28,8 +28,9 @@ from drivers.links.link import DeviceError
 from rig.base.errors import RigError
 from rig.base.table import Table
 from rig.base.toml_file import load_table
-from rig.bench.bench import simulated_bench
-from rig.experiment import prepare, run
+from rig.protocol.experiment import prepare
+from rig.run.backend import simulated_bench
+from rig.run.run import run
 from rig.scene.scene import load_scene
 
 LOGS = Path(str(files("sim_fixtures"))) / "logs"

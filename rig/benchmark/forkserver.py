@@ -22,7 +22,8 @@ from typing import Any
 
 from drivers.links.link import DeviceError
 from rig.base.errors import RigError
-from rig.experiment import Consent, Experiment, prepare, run
+from rig.protocol.experiment import Experiment, prepare
+from rig.run.run import Consent, run
 from rig.safety import remote
 
 CONSENT = Consent("a benchmark", "a benchmark")

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 from drivers.instruments.gsv8 import Decoder, Measured
 from drivers.roles import Device, ForceSample, Sample
-from rig import experiment
 from rig.base.clock import RealClock
 from rig.base.errors import RigError
 from rig.base.toml_file import validate
@@ -38,6 +37,10 @@ from rig.bench.bench import Bench
 from rig.engine.engine import LONGEST_TURN_S, SETUP_LIMIT_S, SHORTEST_TURN_S
 from rig.log.reader import read_log
 from rig.log.schema import ROLES
+from rig.protocol.experiment import prepare
+from rig.run.backend import open_bench
+from rig.run.run import Consent
+from rig.run.run import run as run_experiment
 from rig.scene.scene import Scene, load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.settings import ForceTruth
@@ -189,7 +192,7 @@ def _drivers(path: Path, seconds: float, progress: Callable[[float], None]) -> R
     scene, _ = load_scene(path)
     readings: list[float] = []
     counts: dict[str, int] = {}
-    with _simulator(path) as (simulator, ports), closing(Bench(_without_hv(scene).with_ports(ports))) as bench:
+    with _simulator(path) as (simulator, ports), closing(open_bench(_without_hv(scene).with_ports(ports))) as bench:
         clock, devices = bench.clock, bench.devices
         bench.attach(lambda role, way, data, t: None)
         give_up = clock.now() + SETUP_LIMIT_S
@@ -260,8 +263,8 @@ def _whole_run(path: Path, folder: Path, progress: Callable[[float], None]) -> R
             marks.append((clock.now(), process_time(), _processor_time(simulator)))
             progress(done / total)
 
-        consent = experiment.Consent(arm="a benchmark", answers="a benchmark")
-        experiment.run(experiment.prepare(path, protocol, ports), log_path, note, consent)
+        consent = Consent(arm="a benchmark", answers="a benchmark")
+        run_experiment(prepare(path, protocol, ports), log_path, note, consent)
     elapsed, host, there = np.subtract(marks[-1], marks[0])
     log = read_log(log_path)
     tables = log.tables(["/force/sample", "/stage/sample", "/displacement/sample"])

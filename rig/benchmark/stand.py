@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from rig.base.errors import RigError
-from rig.bench.bench import simulated_bench
+from rig.run.backend import simulated_bench
 from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.served import Driven, ServedBench

@@ -64,7 +64,7 @@ def _run(
     from rig.analysis.sensor_protocols import protocol_text
     from rig.base.outputs import write_text
     from rig.cli.running import run_and_tell
-    from rig.experiment import prepare
+    from rig.protocol.experiment import prepare
     from rig.scene.scene import load_scene
 
     log, steps = out / f"{quantity}.mcap", protocol or out / f"{quantity}.protocol.toml"

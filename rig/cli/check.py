@@ -12,7 +12,7 @@ from rig.cli.files import FILE
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from rig.experiment import Experiment
+    from rig.protocol.experiment import Experiment
 
 
 @click.command("check")
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def command(scene: Path, protocol: Path) -> None:
     """Validate SCENE and PROTOCOL and print the plan with what the model predicts. Touches no hardware."""
     from rig.cli.show import show
-    from rig.experiment import prepare
+    from rig.protocol.experiment import prepare
 
     show(plan_table(prepare(scene, protocol)))
 

@@ -34,8 +34,8 @@ def command(out: Path | None, seed: int) -> None:
     from rig.base.progress import progress
     from rig.cli.fit import identification_table
     from rig.cli.show import show
-    from rig.experiment import prepare
-    from rig.experiment import run as run_experiment
+    from rig.protocol.experiment import prepare
+    from rig.run.run import run as run_experiment
 
     folder = _make_folder(out)
     with as_file(files("sim_fixtures")) as fixtures:

@@ -23,7 +23,7 @@ def command(scene: Path, protocol: Path, out: Path, ports: Path | None, arm: boo
     """Run PROTOCOL on the bench of SCENE and log every byte. Ctrl-C ends it safely, Ctrl-Z or p pauses it."""
     from rig.base.outputs import check_new
     from rig.cli.running import run_and_tell
-    from rig.experiment import prepare
+    from rig.protocol.experiment import prepare
 
     check_new(out)
     experiment = prepare(scene, protocol, read_ports(ports))

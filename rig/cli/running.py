@@ -8,8 +8,9 @@ import click
 
 from rig.base.errors import ConfigError
 from rig.base.progress import progress
-from rig.experiment import Consent, Experiment
-from rig.experiment import run as run_experiment
+from rig.protocol.experiment import Experiment
+from rig.run.run import Consent
+from rig.run.run import run as run_experiment
 
 
 def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, take_down: bool) -> None:

@@ -17,8 +17,8 @@ def command(scene: Path) -> None:
     """Serve the simulated bench of SCENE, or the log in its place, on pseudo-terminals; prints the ports as JSON."""
     from rig.base.clock import RealClock
     from rig.base.errors import ConfigError
-    from rig.bench.bench import wired_bench
     from rig.operator.signals import stop_on_signals
+    from rig.run.backend import wired_bench
     from rig.scene.scene import load_scene
 
     if os.name != "posix":

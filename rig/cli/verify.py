@@ -26,7 +26,7 @@ def command(quantity: Quantity, scene: Path, standard: float, out: Path, arm: bo
     from rig.analysis.sensor_protocols import verify_text
     from rig.base.outputs import check_new, write_text
     from rig.cli.running import run_and_tell
-    from rig.experiment import prepare
+    from rig.protocol.experiment import prepare
     from rig.scene.scene import load_scene
 
     loaded, _ = load_scene(scene)

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from calibration.sensors.certificate import Certificate
     from rig.log.process import LogProcess
     from rig.log.writer import LogWriter
+    from rig.safety.remote import RemoteGuard
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
 SETUP_LIMIT_S = 15.0
@@ -118,6 +119,8 @@ class Engine:
         How the operator asked for high voltage when he started the run; without it none is given.
     take_down : str
         How he chose, when he started the run, to have an output taken down that is found live; empty: he did not.
+    guard_process : RemoteGuard, optional
+        The guard, when it is a process of its own; without it the engine makes one for a supply in memory.
     """
 
     def __init__(
@@ -131,6 +134,7 @@ class Engine:
         certificates: Mapping[str, Certificate] | None = None,
         requested: str = "",
         take_down: str = "",
+        guard_process: RemoteGuard | None = None,
     ) -> None:
         self.bench = bench
         self.clock = bench.clock
@@ -147,6 +151,7 @@ class Engine:
         self._progress = progress
         self._certificates = certificates or {}
         self.guard: AnyGuard | None = None
+        self._guard_process = guard_process
         self._host = HostTime(self.clock)
         self._beats = 0
         self._next_beat = -math.inf
@@ -271,7 +276,7 @@ class Engine:
         return False
 
     def _appoint_guard(self) -> None:
-        scene, process = self.bench.scene, self.bench.guard_process
+        scene, process = self.bench.scene, self._guard_process
         if scene.hv is None:
             return
 

@@ -13,6 +13,9 @@ from rig.log.text import printable
 if TYPE_CHECKING:
     from calibration.sensors.certificate import Certificate
 
+# In a log's metadata: on what bench it was. In memory its truth is that of its own scene.
+IN_MEMORY, ON_PORTS = "simulated in memory", "real ports"
+
 _SAID = re.compile(r"model (.*?), serial (.*?), firmware (.*?)(?:;|$)")
 
 

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 from calibration.sensors.certificate import Certificate
 from rig.base.errors import ConfigError, LimitError
 from rig.base.toml_file import parse_table
-from rig.experiment import ON_PORTS, Experiment
 from rig.log import schema
-from rig.log.contents import certificates_in
+from rig.log.contents import ON_PORTS, certificates_in
 from rig.log.errors import LogError
 from rig.log.reader import Log, read_log
+from rig.protocol.experiment import Experiment
 from rig.protocol.plan import Action, plan
 from rig.protocol.protocol import Protocol
 from rig.run.resume import actions_from

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from rig.bench.bench import Bench
+from rig.bench.opening import open_memory
 from rig.engine.engine import Engine, Outcome
-from rig.experiment import gains_of
 from rig.operator.control import Answer, Control, Question
+from rig.protocol.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench
 from rig.replay.recording import Recording
 from rig.replay.steering import SteeredBench
@@ -87,7 +88,7 @@ def rerun(recording: Recording, *, steered: bool | None = None) -> Rerun:
         bench = SteeredBench(experiment.scene, replay, recording)
         log.listener = bench.decided
     else:
-        bench = Bench(experiment.scene, replay)
+        bench = Bench(experiment.scene, open_memory(experiment.scene, replay))
     engine = Engine(
         bench,
         experiment.actions,

@@ -21,7 +21,10 @@ from typing import Any, cast
 from drivers.links.link import DeviceError
 from drivers.roles import Device, HVSupply, Sample
 from rig.base.clock import VirtualClock
-from rig.bench.bench import Bench, Tap, Wired
+from rig.bench.bench import Bench
+from rig.bench.opening import open_memory
+from rig.bench.tap import Tap
+from rig.bench.wired import Wired
 from rig.engine.engine import SHORTEST_TURN_S
 from rig.replay.recording import Recording, Row
 from rig.scene.scene import Scene
@@ -316,10 +319,7 @@ class SteeredBench(Bench):
 
     def __init__(self, scene: Scene, wired: Wired, recording: Recording) -> None:
         self._steering = Steering(recording)
-        super().__init__(scene, wired)
-
-    def _make_clock(self, wired: Wired) -> VirtualClock:
-        return _Clock(self._steering, wired.advance)
+        super().__init__(scene, open_memory(scene, wired, _Clock(self._steering, wired.advance)))
 
     def attach(self, tap: Tap) -> None:
         super().attach(tap)

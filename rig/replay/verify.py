@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 from drivers.links.link import DeviceError
 from drivers.roles import HVSupply, Stage
 from rig.bench.bench import Bench
-from rig.experiment import gains_of
+from rig.bench.opening import open_memory
 from rig.log import schema
 from rig.log.recorder import Recorder
+from rig.protocol.experiment import gains_of
 from rig.replay.recording import Recording, Row, numbers
 from rig.scene.scene import CanTable, Scene
 from rig.sim.wire import ByteWire, Frame, FrameWire
@@ -202,7 +203,7 @@ class _Verifier:
         self._recording = recording
         scene = recording.experiment.scene
         self._desk = _Desk(scene)
-        self._bench = Bench(scene, self._desk)
+        self._bench = Bench(scene, open_memory(scene, self._desk))
         self._rows = _Rows()
         self._recorder = Recorder(
             cast("LogWriter", self._rows),

@@ -19,10 +19,10 @@ from drivers.roles import Identity
 from rig.base.clock import VIRTUAL_EPOCH_NS, calendar_now
 from rig.base.errors import ConfigError
 from rig.base.toml_file import parse_table, validate
-from rig.experiment import Experiment
 from rig.log.contents import certificates_in, identities_in
 from rig.log.reader import Log, read_log
 from rig.protocol import protocol as steps
+from rig.protocol.experiment import Experiment
 from rig.protocol.plan import Action, check_plan, plan, plan_from
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import Scene
@@ -36,7 +36,7 @@ def prepare_resumed(
     Parameters
     ----------
     ports : dict, optional
-        As for `rig.experiment.prepare`.
+        As for `rig.protocol.experiment.prepare`.
     now_ns : int, optional
         Nanoseconds since 1970 at which it is taken up; by default now, and on the bench in memory, whose film is a new
         one each time, the beginning of its time.

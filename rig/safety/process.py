@@ -31,13 +31,13 @@ from drivers.roles import HVSample, HVSupply
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, LimitError
 from rig.base.host import HostTime
+from rig.bench.devices import ROLE, Link, SupplyTable, make_supply, open_link
 from rig.log.errors import LogError
 from rig.log.recorder import Severity
 from rig.log.remote import RemoteLog
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import ADVICE, AT_ONCE_S, NOT_SAFE, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
-from rig.safety.supply import ROLE, Link, SupplyTable, make_driver, open_link
 from rig.scene.scene import Scene
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005
@@ -83,7 +83,7 @@ def serve(end: socket.socket, configured: bytes) -> None:
     scene = Scene.model_validate(known["scene"])
     assert scene.hv is not None
     try:
-        link = open_link(scene.hv)
+        link = open_link(ROLE, scene.hv)
     except Exception as error:
         channel.send({"is": "error", "error": pack_error(error)})
         return
@@ -262,7 +262,7 @@ class Server:
     def _appoint(self, message: Message) -> None:
         """Put the driver on its link: from here on it is polled."""
         self._gain = float(message["gain"])
-        self._supply = make_driver(self._table, self._link, self._tell_wire, lambda: self._polled_at)
+        self._supply = make_supply(self._table, self._link, self._tell_wire, lambda: self._polled_at)
         limits = Limits.of(self._scene)
         film = FilmLimits(self._scene.specimen.specimen(), limits)
         film.capacitance(0.0, 0.0)  # the model's first answer takes longest

@@ -22,13 +22,13 @@ from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSil
 from drivers.roles import HVFlag, HVSample, HVSupply, Identity, Sample
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, LimitError, RigError, StaleData
-from rig.bench.bench import Tap
+from rig.bench.devices import ROLE, Link, make_supply, open_link
+from rig.bench.tap import Tap
 from rig.log.recorder import Severity
 from rig.safety import process
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
-from rig.safety.supply import ROLE, Link, make_driver, open_link
 from rig.scene.scene import IsegTable, Scene
 
 START_S = 30.0  # until the process must have opened the link; a slow disk has many modules to read
@@ -345,8 +345,8 @@ class RemoteGuard:
             return
         self._next_open = self._clock.now() + OPEN_AGAIN_S
         try:
-            self._link = open_link(self._table)
-            supply = make_driver(self._table, self._link, self._tap, self._clock.now)
+            self._link = open_link(ROLE, self._table)
+            supply = make_supply(self._table, self._link, self._tap, self._clock.now)
             limits = Limits.of(self._scene)
             film = FilmLimits(self._scene.specimen.specimen(), limits)
             guard = Guard(supply, limits, film, self._table.ramp_V_per_s, self._tell_now)

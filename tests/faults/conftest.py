@@ -14,7 +14,6 @@ from calibration.sensors.certificate import load_certificate
 from drivers.links.link import DeviceError
 from rig.base.errors import RigError
 from rig.base.toml_file import parse_table
-from rig.bench.bench import Bench
 from rig.engine.engine import Engine, Outcome
 from rig.log.reader import read_log
 from rig.log.recorder import Gains
@@ -22,6 +21,7 @@ from rig.log.writer import LogWriter
 from rig.operator.control import Control
 from rig.protocol.plan import check_plan, plan
 from rig.protocol.protocol import Protocol
+from rig.run.backend import open_bench
 from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
 
@@ -136,7 +136,7 @@ def tell(tmp_path: Path) -> Tell:
             check_plan(actions, parsed)
         certificate = load_certificate(SCENES / parsed.force.certificate)
         gains = Gains(force=certificate.gain, force_unit=certificate.reading_unit, stored_zero=stored_zero)
-        bench = Bench(parsed)
+        bench = open_bench(parsed)
         assert bench.simulated is not None
         simulated, clock, stop = bench.simulated, bench.clock, control or Control(unattended="a test")
         outputs: list[tuple[float, float]] = []

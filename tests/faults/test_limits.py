@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from drivers.roles import ForceSample
 from rig.base.errors import FaultError, LimitError, StaleData
 from rig.base.toml_file import parse_table
-from rig.bench.bench import Bench
 from rig.engine.watch import FROZEN_FEWEST, Watch, check_zero
 from rig.log.reader import read_log
 from rig.log.recorder import Gains, Recorder
 from rig.operator.control import Control
+from rig.run.backend import open_bench
 from rig.safety.limits import Limits
 from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
@@ -216,7 +216,7 @@ class NoLog:
 
 def watch_with(stored_zero: float | None) -> tuple[Watch, Recorder, Limits]:
     scene = parse_table((SCENES / "cone-4mm.toml").read_text(), Scene, "scene", "test")
-    bench = Bench(scene)
+    bench = open_bench(scene)
     bench.attach(lambda role, way, data, t=0.0: None)
     recorder = Recorder(NoLog(), bench.clock, Gains(force=GAIN, stored_zero=stored_zero), has_laser=True)  # type: ignore[arg-type]
     limits = Limits.of(scene)

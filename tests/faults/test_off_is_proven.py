@@ -13,6 +13,7 @@ import pytest
 
 from rig.bench.bench import Bench
 from rig.operator.control import Control
+from rig.run.backend import open_bench
 from rig.safety import process
 from rig.safety.channel import Channel
 from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
@@ -125,7 +126,7 @@ class Alone:
     def __init__(self) -> None:
         scene, _ = load_scene(SCENES / "cone-4mm.toml")
         assert scene.hv is not None
-        self.bench = Bench(scene)
+        self.bench = open_bench(scene)
         assert self.bench.simulated is not None
         self.truth, self.clock = self.bench.simulated, self.bench.clock
         ours, theirs = socket.socketpair()

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.bench.bench import simulated_bench
 from rig.benchmark.stand import PROTOCOL
+from rig.run.backend import simulated_bench
 from rig.scene.scene import load_scene
 from rig.sim.served import ServedBench
 

@@ -21,8 +21,9 @@ from rig.base.errors import ConfigError, LimitError
 from rig.benchmark.fit import simulated
 from rig.cli.app import main
 from rig.cli.plan import proposal_table
-from rig.experiment import certificates_of, prepare, run
+from rig.protocol.experiment import certificates_of, prepare
 from rig.protocol.protocol import Protocol, load_protocol
+from rig.run.run import run
 from rig.scene.scene import load_scene
 
 FIXTURES = Path(__file__).resolve().parents[3] / "sim_fixtures"

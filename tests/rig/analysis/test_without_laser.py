@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rig.analysis.film import UNKNOWN_LAG, identify_logs
-from rig.experiment import prepare, run
+from rig.protocol.experiment import prepare
+from rig.run.run import run
 
 FIXTURES = Path(str(files("sim_fixtures")))
 RUNS = 12

@@ -11,8 +11,9 @@ from click.testing import CliRunner, Result
 from calibration.film.identify import secant_modulus
 from model.material.materials import NAMED
 from rig.cli.app import main
-from rig.experiment import prepare, run
 from rig.log.reader import read_log
+from rig.protocol.experiment import prepare
+from rig.run.run import run
 
 LOGS = ("cone-4mm.mcap", "cone-6mm.mcap")
 TRUTH = NAMED["parker-cao2018"]  # what sim_fixtures/scenes/cone-*.toml hide in [simulation.film]

@@ -17,9 +17,9 @@ from click.testing import CliRunner
 
 from rig.base.clock import RealClock
 from rig.base.toml_file import validate
-from rig.bench.bench import Bench, simulated_bench
+from rig.bench.devices import make_supply, open_link
 from rig.cli.app import main
-from rig.safety.supply import make_driver, open_link
+from rig.run.backend import open_bench, simulated_bench
 from rig.scene.scene import Scene, load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.server import Server
@@ -113,11 +113,11 @@ def test_the_lines_proposed_are_a_scene_on_which_every_instrument_answers(
     limits = {key: value for key, value in known["limits"].items() if key.split("_")[0] not in HIGH_VOLTAGE}
     rest = {"specimen": known["specimen"], "limits": limits, **{r: t for r, t in proposed.items() if r != "hv"}}
     with (
-        closing(Bench(validate(rest, Scene, "scene", "proposed"))) as bench,
-        closing(open_link(whole.hv)) as link,
+        closing(open_bench(validate(rest, Scene, "scene", "proposed"))) as bench,
+        closing(open_link("hv", whole.hv)) as link,
     ):
         bench.attach(lambda *told: None)
-        found = dict(bench.devices) | {"hv": make_driver(whole.hv, link, lambda *told: None, bench.clock.now)}
+        found = dict(bench.devices) | {"hv": make_supply(whole.hv, link, lambda *told: None, bench.clock.now)}
         end = bench.clock.now() + 20.0
         while not all(device.ready for device in found.values()) and bench.clock.now() < end:
             for device in found.values():

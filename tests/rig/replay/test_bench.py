@@ -9,13 +9,13 @@ from click.testing import CliRunner
 
 from drivers.instruments.zaber import ZaberStage
 from rig.base.errors import ConfigError
-from rig.bench.bench import Bench
 from rig.benchmark.fixtures import LOGS
 from rig.cli.app import main
 from rig.log.reader import read_log
 from rig.replay.bench import ReplayError
 from rig.replay.recording import load_recording
 from rig.replay.rerun import rerun
+from rig.run.backend import open_bench
 from rig.scene.scene import load_scene
 
 NO_HV = LOGS / "no-hv"
@@ -107,7 +107,7 @@ def test_a_log_of_other_instruments_is_refused(tmp_path):
     laser = text[text.index("[displacement]") : text.index("[bench]")]
     scene.write_text(text.replace(laser, ""))
     with pytest.raises(ConfigError, match=r"recorded with other instruments.*displacement keyence-lkg"):
-        Bench(load_scene(scene)[0])
+        open_bench(load_scene(scene)[0])
 
 
 def test_ports_and_a_log_exclude_each_other(tmp_path):

@@ -8,12 +8,13 @@ import pytest
 
 from rig.base.errors import Stopped
 from rig.benchmark.fixtures import LOGS
-from rig.experiment import prepare, run
 from rig.operator.control import Control
+from rig.protocol.experiment import prepare
 from rig.replay.recording import load_recording
 from rig.replay.rerun import rerun
 from rig.replay.verify import verify
 from rig.run.resume import prepare_resumed
+from rig.run.run import run
 
 
 class Keys:
@@ -34,9 +35,7 @@ class Keys:
 
 
 def recorded_with(typed, folder, monkeypatch):
-    monkeypatch.setattr(
-        "rig.experiment.Control", lambda sources, answers, say, **_: Control([Keys(typed)], answers, say)
-    )
+    monkeypatch.setattr("rig.run.run.Control", lambda sources, answers, say, **_: Control([Keys(typed)], answers, say))
     experiment = prepare(LOGS / "no-laser" / "scene.toml", LOGS / "no-laser" / "protocol.toml")
     log = folder / "run.mcap"
     with contextlib.suppress(Stopped):

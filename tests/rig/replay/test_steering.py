@@ -10,11 +10,11 @@ import pytest
 from drivers.links.link import DeviceError
 from rig.base.clock import VirtualClock
 from rig.base.errors import RigError
-from rig.bench.bench import Bench
 from rig.benchmark.fixtures import LOGS
-from rig.experiment import prepare, run
+from rig.protocol.experiment import prepare
 from rig.replay.recording import Recording, load_recording
 from rig.replay.rerun import rerun
+from rig.run.run import run
 
 STEP_S, WAKING_S = 20e-6, 100e-6  # mean time between two looks at the clock; by which a sleep is too long
 HELD_UP, HELD_UP_S = 0.03, 0.03  # how often something else has the processor meanwhile, and for how long at most
@@ -48,7 +48,7 @@ def test_requests_keep_their_order_however_busy_the_machine_was(tmp_path, monkey
     log = tmp_path / "run.mcap"
     experiment = prepare(LOGS / name / "scene.toml", LOGS / name / "protocol.toml")
     with monkeypatch.context() as busy, contextlib.suppress(RigError, DeviceError):
-        busy.setattr(Bench, "_make_clock", lambda self, wired: BusyClock(wired.advance, seed))
+        busy.setattr("rig.bench.opening.VirtualClock", lambda advance: BusyClock(advance, seed))
         run(experiment, log, lambda done, total, label: None)
     recording = load_recording(log)
     monkeypatch.setattr(Recording, "in_virtual_time", False)

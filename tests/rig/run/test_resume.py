@@ -16,12 +16,13 @@ from rig.base.clock import VIRTUAL_EPOCH_NS
 from rig.base.errors import ConfigError, Stopped
 from rig.base.toml_file import parse_table
 from rig.cli.app import main
-from rig.experiment import prepare, run
 from rig.log.dataset import load_run
 from rig.log.reader import read_log
+from rig.protocol.experiment import prepare
 from rig.protocol.plan import plan, plan_from
 from rig.protocol.protocol import Protocol
 from rig.run.resume import prepare_resumed
+from rig.run.run import run
 from rig.scene.scene import Scene, load_scene
 
 SCENE = Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml"

@@ -18,16 +18,16 @@ from calibration.sensors.certificate import load_certificate
 from drivers.links.link import DeviceError
 from model.membrane.solve import solve_many
 from rig.base.errors import ConfigError, RigError, Stopped
-from rig.bench.bench import Bench
 from rig.engine.engine import Engine, Outcome
-from rig.experiment import prepare
-from rig.experiment import run as run_experiment
 from rig.log.dataset import Run, load_run
 from rig.log.export import export
 from rig.log.info import info
 from rig.log.recorder import Gains
 from rig.log.writer import LogWriter
 from rig.operator.control import Control
+from rig.protocol.experiment import prepare
+from rig.run.backend import open_bench
+from rig.run.run import run as run_experiment
 from rig.sim.bench import SimulatedBench
 
 FIXTURES = Path(str(files("sim_fixtures")))
@@ -77,7 +77,7 @@ def tell(folder: Path, *, mischief: Callable[[Control], None] | None = None, gai
     protocol, path = folder / "protocol.toml", folder / "run.mcap"
     protocol.write_text(PROTOCOL)
     experiment = prepare(SCENE, protocol)
-    bench, stop = Bench(experiment.scene), Control(unattended="a test")
+    bench, stop = open_bench(experiment.scene), Control(unattended="a test")
     simulated, clock = bench.simulated, bench.clock
     assert simulated is not None
     outputs = [0.0]

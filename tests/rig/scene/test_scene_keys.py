@@ -20,7 +20,9 @@ from drivers.instruments.zaber import ZaberStage
 from drivers.links.link import DeviceRefused
 from drivers.roles import Sample
 from rig.base.toml_file import parse_table
-from rig.bench.bench import Bench, arguments
+from rig.bench.bench import Bench
+from rig.bench.devices import arguments
+from rig.run.backend import open_bench
 from rig.scene.scene import CiA404Table, GSV8Table, IsegTable, KeyenceTable, Scene, ShvpsTable, ZaberTable
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
@@ -54,7 +56,7 @@ def ready(*changes: tuple[str, str], scene: str = "cone-4mm") -> Iterator[tuple[
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
-    with closing(Bench(parse_table(text, Scene, "scene", "test"))) as bench:
+    with closing(open_bench(parse_table(text, Scene, "scene", "test"))) as bench:
         bench.attach(lambda *told: None)
         samples: dict[str, list[Sample]] = {role: [] for role in bench.devices}
         while bench.clock.now() < 2.0:

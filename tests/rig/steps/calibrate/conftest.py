@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from rig.analysis.sensors import Calibration, calibrate
-from rig.experiment import prepare, run
+from rig.protocol.experiment import prepare
+from rig.run.run import run
 
 FIXTURES = Path(str(files("sim_fixtures")))
 SCENE = """

@@ -13,10 +13,11 @@ from rig.analysis.fit_file import read_fit
 from rig.analysis.strokes import strokes
 from rig.base.errors import FaultError, LimitError
 from rig.cli.app import main
-from rig.experiment import prepare, run
 from rig.follow.plan import rest_from
 from rig.log.dataset import load_run
 from rig.log.reader import read_log
+from rig.protocol.experiment import prepare
+from rig.run.run import run
 from rig.scene.scene import load_scene
 
 

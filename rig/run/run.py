@@ -13,73 +13,23 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-from calibration.sensors.certificate import Certificate, CertificateError, load_certificate
+from calibration.sensors.certificate import Certificate
 from rig.base.clock import Clock, calendar_now
-from rig.base.errors import ConfigError, FaultError, LimitError
-from rig.bench.bench import Bench
-from rig.calibrate.steps import CALIBRATION
+from rig.base.errors import FaultError
 from rig.engine.engine import Engine, Outcome
 from rig.log import space
+from rig.log.contents import IN_MEMORY, ON_PORTS
 from rig.log.process import LogProcess
 from rig.log.recorder import Gains
 from rig.log.writer import LogWriter
 from rig.operator.control import Control, Keyboard, Source
 from rig.operator.signals import stop_on_signals
-from rig.protocol.plan import Action, Prediction, check_plan, plan
-from rig.protocol.protocol import Protocol, load_protocol
+from rig.protocol.experiment import Experiment, gains_of
+from rig.run.backend import Backend
 from rig.safety.guard import ADVICE
-from rig.scene.scene import Scene, load_scene
+from rig.scene.scene import Scene
 
-# In a log's metadata: on what bench it was. In memory its truth is that of its own scene.
-IN_MEMORY, ON_PORTS = "simulated in memory", "real ports"
 RECORDED_PACKAGES = ("dea-rig", "numpy", "scipy", "mcap", "protobuf", "pydantic", "pyserial", "python-can")
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """A scene and a protocol that fit each other, with the certificates of the scene's sensors.
-
-    Everything that can be found wrong without touching hardware has been looked for once this exists.
-    """
-
-    scene: Scene
-    scene_text: str
-    protocol: Protocol
-    protocol_text: str
-    certificates: dict[str, Certificate]
-    actions: list[Action]
-    predictions: list[Prediction]
-    resumed: dict[str, str] | None = None  # of which log this is the rest, for the log
-    stored_zero: float | None = None  # of the force sensor, from the run that this one goes on with
-
-    @property
-    def duration(self) -> float:
-        """Planned duration in seconds."""
-        return sum(action.duration for action in self.actions)
-
-
-def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, object]] | None = None) -> Experiment:
-    """Load and check everything; touches no hardware.
-
-    Parameters
-    ----------
-    ports : dict, optional
-        Ports by role as ``dea-rig sim`` prints them; they take the place of the scene's own.
-
-    Raises
-    ------
-    ConfigError, LimitError
-        With the file, key or step, the value and what is allowed.
-    """
-    scene, scene_text = load_scene(scene_path)
-    if ports is not None:
-        scene = scene.with_ports(ports)
-    protocol, protocol_text = load_protocol(protocol_path)
-    certificates = certificates_of(scene, scene_path.parent)
-    actions = plan(protocol, scene)
-    predictions = check_plan(actions, scene)
-    _check_ranges(certificates, actions, predictions)
-    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions)
 
 
 @dataclass(frozen=True)
@@ -119,7 +69,8 @@ def run(
     in_memory = not experiment.scene.on_real_ports
     if consent is None:
         consent = Consent(IN_MEMORY, IN_MEMORY) if in_memory else Consent()
-    bench = Bench(experiment.scene)
+    backend = Backend(experiment.scene)
+    bench = backend.bench
     outcome: Outcome | None = None
     try:
         problems = _check_dates(experiment.certificates, bench.clock)
@@ -129,8 +80,8 @@ def run(
             stop_on_signals(control, control.ask_pause),
         ):
             _attach(log, experiment, problems, _this_origin() if origin is None else origin)
-            if bench.guard_process is not None and isinstance(log, LogProcess):
-                bench.guard_process.log_to(out, log.second)
+            if backend.guard is not None and isinstance(log, LogProcess):
+                backend.guard.log_to(out, log.second)
                 log.second.close()
             certificates = experiment.certificates
             engine = Engine(
@@ -143,6 +94,7 @@ def run(
                 certificates,
                 requested=consent.arm,
                 take_down=consent.take_down,
+                guard_process=backend.guard,
             )
             outcome, error = engine.run()
             bench.close()  # before the log ends: closing a device may say a last word on its wire
@@ -171,49 +123,10 @@ def _sources(out: Path) -> list[Source]:
     return [Remote(out.resolve()), *([keyboard] if keyboard is not None else [])]
 
 
-def certificates_of(scene: Scene, folder: Path) -> dict[str, Certificate]:
-    """The certificates that the scene in ``folder`` names, by role; ConfigError when one cannot be used."""
-    found: dict[str, Certificate] = {}
-    for role, table in scene.instruments.items():
-        if table.certificate is None:
-            continue
-        try:
-            certificate = load_certificate(folder / table.certificate)
-        except CertificateError as error:
-            raise ConfigError(f"{role}.certificate: {error}.") from None
-        if certificate.role != role:
-            raise ConfigError(
-                f"{role}.certificate = {table.certificate!r}: this certificate is for the role {certificate.role!r}."
-            )
-        found[role] = certificate
-    return found
-
-
-def _check_ranges(certificates: dict[str, Certificate], actions: list[Action], predictions: list[Prediction]) -> None:
-    """Nothing is planned where a sensor is not calibrated. Calibrations themselves go further."""
-    for action, prediction in zip(actions, predictions, strict=True):
-        if action.kind in CALIBRATION:
-            continue
-        for role, value, unit in (("force", prediction.peak_force, "N"), ("hv", max(action.voltage), "V")):
-            used = certificates.get(role)
-            if used is not None and not value <= used.high:
-                raise LimitError(
-                    f"Step {action.step} ({action.kind}, {action.label}): {value:.4g} {unit} are expected, and "
-                    f"{used.name} is calibrated up to {used.high:.4g} {unit} only. Calibrate further, or ask for less."
-                )
-
-
 def _check_dates(certificates: dict[str, Certificate], clock: Clock) -> list[str]:
     """Problems with the certificates' dates; the engine checks serial numbers once the instruments have answered."""
     today = datetime.fromtimestamp(clock.epoch_ns(clock.now()) * 1e-9, UTC).date()
     return [problem for certificate in certificates.values() for problem in certificate.check("", today)]
-
-
-def gains_of(certificates: dict[str, Certificate]) -> Gains:
-    """Quantity per reading of each sensor, by the certificates."""
-    gain = {role: certificate.gain for role, certificate in certificates.items()}
-    force = certificates["force"]  # every scene names it
-    return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit, force.stored_zero)
 
 
 def _gains(experiment: Experiment) -> Gains:

@@ -1,0 +1,100 @@
+"""Scene and protocol, loaded, held against each other and planned: all that can be found wrong without hardware."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibration.sensors.certificate import Certificate, CertificateError, load_certificate
+from rig.base.errors import ConfigError, LimitError
+from rig.calibrate.steps import CALIBRATION
+from rig.log.recorder import Gains
+from rig.protocol.plan import Action, Prediction, check_plan, plan
+from rig.protocol.protocol import Protocol, load_protocol
+from rig.scene.scene import Scene, load_scene
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A scene and a protocol that fit each other, with the certificates of the scene's sensors.
+
+    Everything that can be found wrong without touching hardware has been looked for once this exists.
+    """
+
+    scene: Scene
+    scene_text: str
+    protocol: Protocol
+    protocol_text: str
+    certificates: dict[str, Certificate]
+    actions: list[Action]
+    predictions: list[Prediction]
+    resumed: dict[str, str] | None = None  # of which log this is the rest, for the log
+    stored_zero: float | None = None  # of the force sensor, from the run that this one goes on with
+
+    @property
+    def duration(self) -> float:
+        """Planned duration in seconds."""
+        return sum(action.duration for action in self.actions)
+
+
+def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, object]] | None = None) -> Experiment:
+    """Load and check everything; touches no hardware.
+
+    Parameters
+    ----------
+    ports : dict, optional
+        Ports by role as ``dea-rig sim`` prints them; they take the place of the scene's own.
+
+    Raises
+    ------
+    ConfigError, LimitError
+        With the file, key or step, the value and what is allowed.
+    """
+    scene, scene_text = load_scene(scene_path)
+    if ports is not None:
+        scene = scene.with_ports(ports)
+    protocol, protocol_text = load_protocol(protocol_path)
+    certificates = certificates_of(scene, scene_path.parent)
+    actions = plan(protocol, scene)
+    predictions = check_plan(actions, scene)
+    _check_ranges(certificates, actions, predictions)
+    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions)
+
+
+def certificates_of(scene: Scene, folder: Path) -> dict[str, Certificate]:
+    """The certificates that the scene in ``folder`` names, by role; ConfigError when one cannot be used."""
+    found: dict[str, Certificate] = {}
+    for role, table in scene.instruments.items():
+        if table.certificate is None:
+            continue
+        try:
+            certificate = load_certificate(folder / table.certificate)
+        except CertificateError as error:
+            raise ConfigError(f"{role}.certificate: {error}.") from None
+        if certificate.role != role:
+            raise ConfigError(
+                f"{role}.certificate = {table.certificate!r}: this certificate is for the role {certificate.role!r}."
+            )
+        found[role] = certificate
+    return found
+
+
+def _check_ranges(certificates: dict[str, Certificate], actions: list[Action], predictions: list[Prediction]) -> None:
+    """Nothing is planned where a sensor is not calibrated. Calibrations themselves go further."""
+    for action, prediction in zip(actions, predictions, strict=True):
+        if action.kind in CALIBRATION:
+            continue
+        for role, value, unit in (("force", prediction.peak_force, "N"), ("hv", max(action.voltage), "V")):
+            used = certificates.get(role)
+            if used is not None and not value <= used.high:
+                raise LimitError(
+                    f"Step {action.step} ({action.kind}, {action.label}): {value:.4g} {unit} are expected, and "
+                    f"{used.name} is calibrated up to {used.high:.4g} {unit} only. Calibrate further, or ask for less."
+                )
+
+
+def gains_of(certificates: dict[str, Certificate]) -> Gains:
+    """Quantity per reading of each sensor, by the certificates."""
+    gain = {role: certificate.gain for role, certificate in certificates.items()}
+    force = certificates["force"]  # every scene names it
+    return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit, force.stored_zero)
