@@ -7,12 +7,14 @@ things inside the functions that use them, so that ``dea-rig --help`` answers at
 
 from __future__ import annotations
 
-import pkgutil
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 ENTRY_POINTS = "dea_rig.commands"
 HELPERS = {"app", "files", "running", "show", "talk"}  # modules of this package that are no commands
@@ -29,14 +31,10 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         own = _own()
         if cmd_name in own:
-            command: Any = import_module(f"rig.cli.{own[cmd_name]}").command
-        else:
-            entry = _others().get(cmd_name)
-            if entry is None:
-                return None
-            command = entry.load()
-        assert isinstance(command, click.Command), f"{cmd_name} is no command"
-        return command
+            command: click.Command = import_module(f"rig.cli.{own[cmd_name]}").command
+            return command
+        entry = _others().get(cmd_name)
+        return None if entry is None else _load(entry)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -63,24 +61,43 @@ class Commands(click.Group):
 
 def _own() -> dict[str, str]:
     """Command name -> module of this package."""
-    modules = (module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]))
-    return {name.rstrip("_").replace("_", "-"): name for name in modules if name not in HELPERS}
+    modules = {file.stem for file in Path(__file__).parent.glob("[a-z]*.py")}
+    return {name.rstrip("_").replace("_", "-"): name for name in modules - HELPERS}
 
 
-def _others() -> dict[str, Any]:
+def _others() -> dict[str, EntryPoint]:
     """Command name -> entry point of another package."""
     from importlib.metadata import entry_points
 
     return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
 
 
+def _load(entry: EntryPoint) -> click.Command:
+    """Another package's command; when it cannot be loaded, one that says so, and the rest goes on working."""
+    try:
+        command = entry.load()
+    except Exception as error:
+        command = error
+    if isinstance(command, click.Command):
+        return command
+    where = f"{entry.value}, an entry point of {ENTRY_POINTS}"
+    why = f"it is not a click command: {command!r}" if not isinstance(command, Exception) else repr(command)
+    message = f"The command {entry.name} ({where}) cannot be loaded: {why}."
+
+    def refuse(**_: object) -> None:
+        raise click.ClickException(message)
+
+    return click.Command(entry.name, callback=refuse, help=message, short_help="Cannot be loaded.")
+
+
 def _exit_code(error: Exception) -> int | None:
     """The exit code of an error that is meant for the operator; None for a mistake of ours."""
-    from drivers.links.link import DeviceError
     from rig.base.errors import RigError
 
     if isinstance(error, RigError):
         return error.exit_code
+    from drivers.links.link import DeviceError
+
     if isinstance(error, DeviceError):
         return 4
     return 1 if isinstance(error, OSError) else None  # the disk or terminal that was to be written to

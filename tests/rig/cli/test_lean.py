@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 from importlib.resources import files
@@ -80,3 +81,41 @@ def test_a_run_without_hv_on_real_ports_starts_no_guard_and_imports_no_can() -> 
         )
         found = imported_by(code)
     assert "serial" in found and "can" not in found
+
+
+CONTROL = {"rig", "rig.cli", "rig.cli.app", "rig.cli.files", "rig.cli.talk", "rig.operator", "rig.operator.live"}
+CONTROL |= {"rig.base", "rig.base.errors", "rig.base.clock"}
+
+
+@pytest.mark.parametrize("word", ["stop", "pause", "continue"])
+def test_the_commands_for_emergencies_load_the_control_channel_and_nothing_else(word: str, tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom click.testing import CliRunner\nfrom rig.cli.app import main\nbefore = len(sys.modules)\n"
+        f"done = CliRunner().invoke(main, [{word!r}])\nassert done.exit_code == 2, done.output\n"
+        "own = sorted(m for m in sys.modules if m.split('.')[0] in ('rig', 'drivers', 'model', 'calibration'))\n"
+        "print(len(sys.modules) - before, *own)"
+    )
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60, env=environment)
+    more, *own = done.stdout.split()
+    module = "rig.cli.continue_" if word == "continue" else f"rig.cli.{word}"
+    assert set(own) <= CONTROL | {module}, own
+    assert int(more) < 60  # click alone has 150 and more
+
+
+@pytest.mark.slow
+def test_they_and_the_help_cost_at_most_half_as_much_again_as_the_version(tmp_path: Path) -> None:
+    """CPU time of whole processes, the least of several: what else the machine does counts little."""
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+
+    def cost(word: str) -> float:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, "-m", "rig", word], capture_output=True, timeout=60, env=environment)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    words = ("--version", "--help", "stop", "pause", "continue")
+    least = {word: min(cost(word) for _ in range(7)) for word in words}
+    for word in words[1:]:
+        assert least[word] <= 1.5 * least["--version"], least
