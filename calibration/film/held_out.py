@@ -4,33 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from calibration.film.curve import Curve
 from calibration.film.problem import IdentificationError, Problem
 from calibration.film.reduction import select
+from calibration.film.result import HeldOut
 from calibration.film.search import minimise_many
 from model.material.materials import Material
 from model.membrane.solve import Wrinkling
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Curves that took no part in a fit, against what the fit says of them (N, root mean square).
-
-    ``expected`` is what noise alone would give. The zeros of a run that was left out are fitted within their priors.
-    """
-
-    what: str
-    rms_residual: float
-    rms_expected: float
-
-    @property
-    def ratio(self) -> float:
-        """Near 1 for a model that predicts; larger for one that only follows the data it was fitted to."""
-        return self.rms_residual / self.rms_expected
 
 
 def held_out(curves: Sequence[Curve], material: Material, wrinkling: Wrinkling = "plain") -> list[HeldOut]:

@@ -13,7 +13,6 @@ be reported, and what it does to the result until then.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
@@ -21,11 +20,10 @@ from numpy.typing import NDArray
 
 from calibration.film.problem import Problem
 from calibration.film.reduction import interpolation_matrix
-from calibration.rounding import two_digits
+from calibration.film.result import SIGNIFICANT, Suspect
 
 Array = NDArray[np.float64]
 
-SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
 RELAXATION_S = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 INSTANTS = 2000  # of a run's time, at which a viscous force is worked out
 ALMOST_SURE = 1.6449  # standard deviations that 95 of 100 stay below
@@ -45,48 +43,6 @@ REMEDIES = {
     HYSTERESIS: "give the curves with their times, and one more at another speed",
     "thickness": "measure the thickness of every specimen",
 }
-
-# Factor and unit in which an amplitude is shown.
-SHOWN = {"1": (100.0, "%"), "m/N": (1e6, "um/N")}
-
-
-@dataclass(frozen=True)
-class Suspect:
-    """An imperfection that the residuals were held against.
-
-    ``amplitude`` with its standard ``uncertainty`` is its size in ``unit``; ``probability`` of as much by chance
-    counts that several suspects were looked at. From the size ``shows_from`` on, 95 of 100 experiments like this one
-    would report it. ``remedy`` tells how to rule it out, or to find it. ``shape`` is what one unit of it does to the
-    weighted residuals.
-    """
-
-    name: str
-    amplitude: float
-    uncertainty: float
-    unit: str
-    probability: float
-    shows_from: float
-    remedy: str
-    shape: Array
-
-    @property
-    def significant(self) -> bool:
-        """Whether it is there for all that chance can do."""
-        return self.probability < SIGNIFICANT
-
-    @property
-    def words(self) -> str:
-        """For the operator, with the size in the unit of the bench."""
-        factor, unit = SHOWN[self.unit]
-        sign = "-" if self.amplitude < 0.0 else "+"
-        size, uncertainty = (two_digits(one * factor) for one in (abs(self.amplitude), self.uncertainty))
-        return f"{self.name} ({sign}{size} {unit}, +- {uncertainty})"
-
-    @property
-    def blind(self) -> str:
-        """For the operator: up to what size it may be there unseen."""
-        factor, unit = SHOWN[self.unit]
-        return f"{self.name} (up to {two_digits(self.shows_from * factor)} {unit})"
 
 
 def suspects(problem: Problem, x: Array, free: NDArray[np.bool_]) -> list[Suspect]:

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 LEAST_DWELL = 2.0  # s at a place worth going to
 PLACE = 2e-3  # what a place less may cost of the sum of logarithms
 ROUNDS, SHARES = 60, 40  # exchanges at most; iterations of the rule for the shares
-IGNORANCE = 100.0  # prior deviation of ln mu, alpha, ln eps_r: says nothing, but leaves no matrix singular
+WIDE_PRIOR = 100.0  # prior deviation of ln mu, alpha, ln eps_r: says nothing, keeps every matrix regular
 
 
 @dataclass(frozen=True, order=True)
@@ -57,10 +57,10 @@ class Places:
         mu, alpha = np.array(material.mu), np.array(material.alpha)
         n, charged = mu.size, bool((voltage != 0.0).any())
         columns = [slopes["mu"] * mu, slopes["alpha"]]
-        prior = [IGNORANCE] * (2 * n)
+        prior = [WIDE_PRIOR] * (2 * n)
         if charged:
             columns.append(slopes["eps_r"][:, None] * material.eps_r)
-            prior.append(IGNORANCE)
+            prior.append(WIDE_PRIOR)
         for slope, size in (
             (np.ones(h.size), errors.force_zero),
             (slopes["h"], errors.displacement_zero),

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +22,7 @@ from calibration.film.curve import Curve
 from calibration.film.problem import IdentificationError, Problem
 from calibration.film.propagation import secant_modulus
 from calibration.film.reduction import select
-from calibration.film.result import Identification
+from calibration.film.result import Identification, Posterior, Sampled
 
 Array = NDArray[np.float64]
 
@@ -33,61 +31,6 @@ MOST_STEPS = 12_000
 LOOK = 500  # steps after which it is looked whether the chain is long enough
 ENOUGH = 50.0  # autocorrelation times that a chain must be long before its times can be believed (emcee's own advice)
 KEPT = 2000  # samples at which derived quantities are worked out
-
-
-@dataclass(frozen=True)
-class Sampled:
-    """One quantity's posterior: mean, standard deviation and central 95 % interval, in ``unit``."""
-
-    mean: float
-    deviation: float
-    low: float
-    high: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """What the chains say.
-
-    Attributes
-    ----------
-    quantities : dict of str to Sampled
-        The names of `Identification.quantities` that depend on the film alone.
-    steps, walkers : int
-    acceptance : float
-        Part of the proposals that were taken.
-    autocorrelation : float
-        Longest integrated autocorrelation time (steps).
-    converged : bool
-        Whether the chain is `ENOUGH` of these long.
-    """
-
-    quantities: dict[str, Sampled]
-    steps: int
-    walkers: int
-    acceptance: float
-    autocorrelation: float
-    converged: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers."""
-        return {
-            "quantities": {
-                name: {
-                    "mean": one.mean,
-                    "standard_deviation": one.deviation,
-                    "interval_95": [one.low, one.high],
-                    "unit": one.unit,
-                }
-                for name, one in self.quantities.items()
-            },
-            "steps": self.steps,
-            "walkers": self.walkers,
-            "acceptance": self.acceptance,
-            "autocorrelation_steps": self.autocorrelation if math.isfinite(self.autocorrelation) else None,
-            "converged": self.converged,
-        }
 
 
 def posterior(

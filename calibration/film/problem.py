@@ -28,7 +28,7 @@ from model.specimen import Specimen
 Array = NDArray[np.float64]
 
 NODES = 8  # of every part of a curve, to begin with
-GIVING = 3  # rounds after which force and giving way agree; each is off by a few per cent of the one before
+COMPLIANCE_ROUNDS = 3  # rounds after which force and giving way agree; each is off by a few per cent of the one before
 TOLERANCE = 1e-7  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
 SHARE_BOUNDS = (1e-6, 100.0)  # positive: so is every mu_n alpha_n, which makes the film stable at any stretch
 EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
@@ -120,7 +120,7 @@ class Problem:
         x = np.zeros(len(self.names))
         for k, one in enumerate(self.nuisances, start=self.film_parameters):
             x[k] = compliance / one.prior if one.kind == "compliance" else 0.0
-        for _ in range(GIVING if x[self.film_parameters :].any() else 1):
+        for _ in range(COMPLIANCE_ROUNDS if x[self.film_parameters :].any() else 1):
             states = self._solve([at], self._shift(x[None]))[0]
             self._give = states.force
         if not np.isfinite(states.force).all():

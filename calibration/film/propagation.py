@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.curve import Curve
-from calibration.film.misfit import Suspect
 from calibration.film.problem import EXPONENT_BOUNDS, Problem
-from calibration.film.result import Quantity, Stiffness, Zero, verdict
+from calibration.film.result import Quantity, RigParameter, Stiffness, Suspect, verdict
 from model.material.materials import Material
 
 Array = NDArray[np.float64]
@@ -32,7 +31,7 @@ SYSTEMATIC = (
 # What is fitted along, and its unit.
 NUISANCES = {"force_zero": "N", "displacement_zero": "m", "lag": "s", "compliance": "m/N"}
 # Standard deviation of an exponent of which no more is known than its range (rectangular: JCGM 100:2008, 4.3.7).
-RANGE = (EXPONENT_BOUNDS[1] - EXPONENT_BOUNDS[0]) / math.sqrt(12.0)
+EXPONENT_DEVIATION = (EXPONENT_BOUNDS[1] - EXPONENT_BOUNDS[0]) / math.sqrt(12.0)
 NEGLIGIBLE = 1e-3  # of the noise: what is less has no line in a budget
 
 
@@ -127,7 +126,7 @@ class Propagation:
         self.problem = problem
         self.film = problem.film(x)
         jacobian = problem.jacobian(x)
-        known = np.eye(problem.terms, x.size, problem.terms) / RANGE if ranges else np.empty((0, x.size))
+        known = np.eye(problem.terms, x.size, problem.terms) / EXPONENT_DEVIATION if ranges else np.empty((0, x.size))
         self.covariance = Covariance(np.concatenate((jacobian, known)), free)
         self.response = self.covariance.response[:, : len(jacobian)]
         self.misfit = misfit
@@ -222,7 +221,7 @@ class Statement:
     """Everything that is derived from a minimum by linear propagation."""
 
     quantities: dict[str, Quantity]
-    nuisance: dict[str, Zero]
+    nuisance: dict[str, RigParameter]
     stretch: tuple[float, float]
     stiffness_curve: Stiffness
     along: list[Quantity]  # the same, with their budgets
@@ -309,7 +308,7 @@ def state(
     for k, one in enumerate(problem.nuisances, start=problem.film_parameters):
         slope = np.zeros(x.size)
         slope[k] = one.prior
-        nuisance[f"{one.kind.replace('_', ' ')} of {one.run}"] = Zero(
+        nuisance[f"{one.kind.replace('_', ' ')} of {one.run}"] = RigParameter(
             value=float(x[k] * one.prior),
             uncertainty=math.hypot(*propagation.budget(slope).values()),
             prior=one.prior,

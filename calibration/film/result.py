@@ -6,15 +6,16 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from calibration.film.held_out import HeldOut
-from calibration.film.misfit import Suspect
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.rounding import two_digits
 from model.material.materials import Material
 from model.membrane.solve import Wrinkling
 
-if TYPE_CHECKING:
-    from calibration.film.posterior import Posterior
+Array = NDArray[np.float64]
 
 CONVENTION = "W = sum mu_n/alpha_n (l1^alpha_n + l2^alpha_n + (l1 l2)^-alpha_n - 3), G = 1/2 sum mu_n alpha_n"
 
@@ -56,7 +57,7 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Zero:
+class RigParameter:
     """An error of the rig that was found with the film's parameters.
 
     ``prior`` is the standard uncertainty that was stated for it, ``uncertainty`` the one that is left. A force zero
@@ -100,6 +101,122 @@ class Stiffness:
     uncertainty: tuple[float, ...]
 
 
+SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
+# Factor and unit in which an amplitude is shown.
+SHOWN = {"1": (100.0, "%"), "m/N": (1e6, "um/N")}
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """An imperfection that the residuals were held against.
+
+    ``amplitude`` with its standard ``uncertainty`` is its size in ``unit``; ``probability`` of as much by chance
+    counts that several suspects were looked at. From the size ``shows_from`` on, 95 of 100 experiments like this one
+    would report it. ``remedy`` tells how to rule it out, or to find it. ``shape`` is what one unit of it does to the
+    weighted residuals.
+    """
+
+    name: str
+    amplitude: float
+    uncertainty: float
+    unit: str
+    probability: float
+    shows_from: float
+    remedy: str
+    shape: Array
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is there for all that chance can do."""
+        return self.probability < SIGNIFICANT
+
+    @property
+    def words(self) -> str:
+        """For the operator, with the size in the unit of the bench."""
+        factor, unit = SHOWN[self.unit]
+        sign = "-" if self.amplitude < 0.0 else "+"
+        size, uncertainty = (two_digits(one * factor) for one in (abs(self.amplitude), self.uncertainty))
+        return f"{self.name} ({sign}{size} {unit}, +- {uncertainty})"
+
+    @property
+    def blind(self) -> str:
+        """For the operator: up to what size it may be there unseen."""
+        factor, unit = SHOWN[self.unit]
+        return f"{self.name} (up to {two_digits(self.shows_from * factor)} {unit})"
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Curves that took no part in a fit, against what the fit says of them (N, root mean square).
+
+    ``expected`` is what noise alone would give. The zeros of a run that was left out are fitted within their priors.
+    """
+
+    what: str
+    rms_residual: float
+    rms_expected: float
+
+    @property
+    def ratio(self) -> float:
+        """Near 1 for a model that predicts; larger for one that only follows the data it was fitted to."""
+        return self.rms_residual / self.rms_expected
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """One quantity's posterior: mean, standard deviation and central 95 % interval, in ``unit``."""
+
+    mean: float
+    deviation: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What the chains say.
+
+    Attributes
+    ----------
+    quantities : dict of str to Sampled
+        The names of `Identification.quantities` that depend on the film alone.
+    steps, walkers : int
+    acceptance : float
+        Part of the proposals that were taken.
+    autocorrelation : float
+        Longest integrated autocorrelation time (steps).
+    converged : bool
+        Whether the chain is long enough for its autocorrelation time to be believed.
+    """
+
+    quantities: dict[str, Sampled]
+    steps: int
+    walkers: int
+    acceptance: float
+    autocorrelation: float
+    converged: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers."""
+        return {
+            "quantities": {
+                name: {
+                    "mean": one.mean,
+                    "standard_deviation": one.deviation,
+                    "interval_95": [one.low, one.high],
+                    "unit": one.unit,
+                }
+                for name, one in self.quantities.items()
+            },
+            "steps": self.steps,
+            "walkers": self.walkers,
+            "acceptance": self.acceptance,
+            "autocorrelation_steps": self.autocorrelation if math.isfinite(self.autocorrelation) else None,
+            "converged": self.converged,
+        }
+
+
 @dataclass(frozen=True)
 class Identification:
     """Everything that a set of curves says about a film.
@@ -116,7 +233,7 @@ class Identification:
         The same over the range of stretch that the data reach; its last value is the quantity ``stiffness_end``.
     least_tangent : float
         Smallest tangent modulus (Pa) over the stretches reached; positive for a stable film.
-    nuisance : dict of str to Zero
+    nuisance : dict of str to RigParameter
         Zeros of force (N) and displacement (m) and lag of the force (s) of every run, and the rig's compliance (m/N).
     chi_square, freedom : float, int
         Of all samples, in their stated standard deviations.
@@ -150,7 +267,7 @@ class Identification:
     stretch: tuple[float, float]
     stiffness_curve: Stiffness
     least_tangent: float
-    nuisance: dict[str, Zero]
+    nuisance: dict[str, RigParameter]
     chi_square: float
     freedom: int
     lack_of_fit: float

@@ -31,7 +31,7 @@ STYLES = (
     ("#56B4E9", "P", (0, (1, 1))),
 )
 BINS = 24
-GIVING = 3  # rounds after which force and giving way agree; each is off by a few per cent of the one before
+COMPLIANCE_ROUNDS = 3  # rounds after which force and giving way agree; each is off by a few per cent of the one before
 RC: Any = {
     "font.size": 9,
     "axes.spines.top": False,
@@ -72,7 +72,7 @@ def model_force(identification: Identification, curve: Curve, h: Array, voltage:
     place = h + found.get(f"displacement zero of {curve.run}", 0.0)
     gives = found.get("compliance of the rig", 0.0) if curve.compliance_uncertainty > 0.0 else 0.0
     force: Array = solve_many(film, place, voltage, wrinkling=identification.wrinkling).force
-    for _ in range(GIVING if gives else 0):
+    for _ in range(COMPLIANCE_ROUNDS if gives else 0):
         force = solve_many(film, place - gives * force, voltage, wrinkling=identification.wrinkling).force
     return force + found.get(f"force zero of {curve.run}", 0.0)
 

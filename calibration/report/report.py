@@ -14,9 +14,8 @@ from typing import Any
 
 from calibration.film.curve import Curve
 from calibration.film.identify import secant_modulus
-from calibration.film.misfit import SHOWN, Suspect
 from calibration.film.reduction import select
-from calibration.film.result import CONVENTION, IDENTIFIED, WEAKLY_IDENTIFIED, Identification, Quantity
+from calibration.film.result import CONVENTION, IDENTIFIED, SHOWN, WEAKLY_IDENTIFIED, Identification, Quantity, Suspect
 from calibration.report import figures
 from calibration.rounding import percent, rounded, stated, two_digits
 from model.material.materials import Material
