@@ -28,12 +28,18 @@ import re
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import NoReturn, TypeVar
+from typing import Literal, NoReturn, TypeVar
+
+from pydantic import Field
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.instrument import Instrument
 from drivers.lines import LineSplitter
 from drivers.links.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
+from drivers.probe import Answered, Line, SerialProbe
+from drivers.recorded import Dialect
 from drivers.roles import OK, DisplacementSample, Identity, SampleFlag
+from drivers.settings import Positive, SerialSettings
 
 T = TypeVar("T")
 
@@ -168,6 +174,23 @@ def _parse(text: str) -> Message | None:
 def _value(field: str) -> Value:
     flag = _SPECIAL.get(field)
     return Value(float(field)) if flag is None else Value(math.nan, flag)
+
+
+class KeyenceSettings(SerialSettings):
+    """A Keyence LK-G laser displacement sensor on RS-232."""
+
+    driver: Literal["keyence-lkg"] = Field(description="Keyence LK-G laser sensor on RS-232.")
+    output: int = Field(default=1, ge=1, le=2, description="OUT number of the controller that looks at the disk.")
+    poll_rate_Hz: float = Field(
+        default=50.0, ge=5, le=200, description="How often the value is asked for (Hz). Typical: 50."
+    )
+    unit_mm: Positive = Field(
+        default=1.0, description="Unit of the controller's display (mm): 0.001 when it is set to micrometres."
+    )
+    limit_mm: Positive = Field(
+        default=80.0,
+        description="Largest displacement that is believed (mm): what the head can show at most, twice its range.",
+    )
 
 
 # One or more questions within a script, ending in a value.
@@ -402,3 +425,27 @@ def _answers(command: str, message: Message) -> bool:
             return message.text == command or message.text.startswith(f"{command},")
         case Pushed():
             return False
+
+
+def _ask(line: Line) -> list[Answered]:
+    codec = Codec()
+    for _ in line.ask(b"\r", codec.feed):  # ends what the question before has left in its buffer
+        pass
+    for message in line.ask(encode("M1"), codec.feed):
+        measuring = isinstance(message, Measured) and message.command == "M1"
+        if measuring or message == Refused("M1", 1):
+            remark = "" if measuring else "It is in communication mode: another program may be using it."
+            return [Answered(Identity("Keyence LK-G"), {"output": 1}, remark)]
+    return []
+
+
+INSTRUMENTS = (
+    Instrument(
+        driver="keyence-lkg",
+        role="displacement",
+        settings=KeyenceSettings,
+        device=KeyenceLKG,
+        dialect=Dialect(b"\r"),
+        probe=SerialProbe(_ask, bauds=(115_200, 9_600), order=20),
+    ),
+)

@@ -25,12 +25,18 @@ import math
 import re
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from typing import TypeVar
+from typing import ClassVar, Literal, TypeVar
+
+from pydantic import Field
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.instrument import Instrument
 from drivers.lines import LineSplitter
 from drivers.links.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
+from drivers.probe import Answered, Line, SerialProbe
+from drivers.recorded import Dialect
 from drivers.roles import HVFlag, HVSample, Identity
+from drivers.settings import SerialSettings, SupplySettings
 
 T = TypeVar("T")
 
@@ -91,6 +97,21 @@ class Codec:
         self._torn = not line.endswith(b"\r")
         self.counters["bad_grammar"] += not good
         return good
+
+
+class ShvpsSettings(SupplySettings, SerialSettings):
+    """The shvps supply of dielectric-elastomer labs on a serial port. Whole volts; it does not measure its current."""
+
+    measures_current: ClassVar[bool] = False
+    whole_volts: ClassVar[bool] = True
+
+    driver: Literal["shvps"] = Field(description="shvps (peta-pico-Voltron) high-voltage supply on a serial port.")
+    poll_rate_Hz: float = Field(
+        default=10.0,
+        gt=0,
+        le=20,
+        description="How often voltage and state are read (Hz); the ramp is made in steps at this rate. Typical: 10.",
+    )
 
 
 class Shvps:
@@ -415,3 +436,31 @@ class Shvps:
     def _require_ready(self) -> None:
         if not self._ready:
             raise DeviceRefused(self._label, "the supply is not set up yet", "Poll it until it is ready.")
+
+
+def _ask(line: Line) -> list[Answered]:
+    codec = Codec()
+
+    def answer(question: str) -> str:
+        return next(iter(line.ask(encode(question), codec.feed)), "")
+
+    kind, version = version_of(answer("QVer"))
+    if not version:
+        return []
+    found, maximum = identity(answer("QName"), version), answer("QVmax")
+    if kind != "slave":
+        return [Answered(found, {}, "A switchboard, no supply by itself.", usable=False)]
+    remark = f"At most {maximum} V; measures no current." if maximum.isdecimal() else "Measures no current."
+    return [Answered(found, {}, remark)]
+
+
+INSTRUMENTS = (
+    Instrument(
+        driver="shvps",
+        role="hv",
+        settings=ShvpsSettings,
+        device=Shvps,
+        dialect=Dialect(b"\r"),
+        probe=SerialProbe(_ask, order=40),
+    ),
+)

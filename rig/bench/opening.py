@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from rig.base.clock import Clock, RealClock, VirtualClock
-from rig.bench.devices import Link, open_link
+from rig.bench.devices import Link
 from rig.bench.memory_link import MemoryByteLink, MemoryFrameLink
 from rig.bench.wired import Wired
 from rig.scene.scene import Scene
@@ -41,7 +41,7 @@ def open_ports(scene: Scene, clock: RealClock) -> Opened:
     try:
         for role, table in scene.instruments.items():
             if table is not scene.hv:
-                opened.links[role] = open_link(role, table)
+                opened.links[role] = table.open(role)
     except BaseException:
         opened.close()
         raise

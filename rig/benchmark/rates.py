@@ -28,7 +28,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.instruments.gsv8 import Decoder, Measured
+from drivers.instruments.gsv8 import GSV8Settings
+from drivers.instruments.gsv8.codec import Decoder, Measured
 from drivers.roles import Device, ForceSample, Sample
 from rig.base.clock import RealClock
 from rig.base.errors import RigError
@@ -332,6 +333,7 @@ def sent_readings(scene: Scene, seconds: float) -> Array:
     bench = SimulatedBench(scene.simulation, scene.specimen.specimen(), {"force"})
     wire = bench.wire("force")
     assert isinstance(wire, ByteWire)
+    assert isinstance(scene.force, GSV8Settings)
     decoder = Decoder()
     found: list[float] = []
     for i in range(1, math.ceil(seconds / 0.1) + 1):

@@ -16,7 +16,7 @@ from model.specimen import Specimen
 from rig.base.errors import ConfigError
 from rig.base.table import Table
 from rig.base.toml_file import read_text, validate
-from rig.scene.scene import MaterialTable
+from rig.scene.specimen import MaterialTable
 
 Positive = Annotated[float, Field(gt=0)]
 Stretch = Annotated[float, Field(ge=1.0, le=6.0)]

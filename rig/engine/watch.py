@@ -181,5 +181,5 @@ def allowed_silence(bench: Bench) -> dict[str, float]:
     if bench.displacement is not None:
         rates["displacement"] = bench.displacement.rate
     if scene.hv is not None:
-        rates["hv"] = scene.hv.poll_rate_Hz
+        rates["hv"] = scene.hv.sample_rate
     return {role: SILENT_PERIODS / rate + scene.instruments[role].timeout_s for role, rate in rates.items()}

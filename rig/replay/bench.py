@@ -14,9 +14,11 @@ from functools import partial
 from typing import NamedTuple, NoReturn
 
 from drivers.links.link import DeviceError
+from drivers.recorded import Passed
+from drivers.registry import instrument
+from drivers.settings import CanSettings
 from rig.replay.recording import Recording
-from rig.replay.served import DIALECTS, Lag, Passed, ServedScript
-from rig.scene.scene import CanTable
+from rig.replay.served import Lag, ServedScript
 from rig.sim.wire import ByteWire, Frame, FrameWire
 
 
@@ -162,9 +164,13 @@ class ReplayBench:
                 passed.setdefault(role, []).append(Passed(row.t, way == "tx", row.fields["data"]))
         for role, table in recording.experiment.scene.instruments.items():
             rows, depart = passed.get(role, []), partial(self._depart, role)
-            script = ServedScript(rows, depart, DIALECTS[table.driver], lag) if real_time else _Script(rows, depart)
+            script = (
+                ServedScript(rows, depart, instrument(role, table.driver).dialect, lag)
+                if real_time
+                else _Script(rows, depart)
+            )
             self.scripts[role] = script
-            if isinstance(table, CanTable):
+            if isinstance(table, CanSettings):
                 self._wires[role] = _ReplayFrameWire(script, table.bitrate)
             else:
                 self._wires[role] = _ReplayByteWire(script)

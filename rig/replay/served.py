@@ -9,123 +9,15 @@ follow from readings, are given some play: their places by a few steps, and one 
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
+
+from drivers.recorded import Dialect, Exchange, Passed
 
 REPEATED = 20  # a request that stands so often in a log is a question that is asked all the time
-NEAR_STEPS = 20  # of the stage, about 10 um: by which the place of a motion may differ
 AT_ONCE_S = 0.05  # a motion replaced so soon may as well not have begun: it is left to chance which reading came first
 ANSWER_S = 0.5  # what comes later after a request comes by itself
-
-_ZABER = re.compile(rb"/(\d+ \d+) (\d+) ?([^:\n]*)(?::[0-9A-F]{2})?\r?\n")
-_ZABER_REPLY = re.compile(rb"@(\d+ \d+) (\d+)([^:\r\n]*)(:[0-9A-F]{2})?\r\n")
-_ZABER_MOTION = re.compile(rb"(\d+ \d+ move abs) (-?\d+)")
-_ZABER_HALT = re.compile(rb"\d+ \d+ (?:stop|move abs -?\d+)")
-_GSV8_HEAD = 3  # prefix, kind with the number of data bytes, command; then data and suffix
-
-
-class Passed(NamedTuple):
-    """What passed on a wire at ``t``: sent by the host, or read by it."""
-
-    t: float
-    sent: bool
-    data: bytes
-
-
-class Exchange(NamedTuple):
-    """A request, and what came after it until the next, each with its delay."""
-
-    request: Passed
-    key: bytes
-    answers: tuple[tuple[float, bytes], ...]
-
-
-class Dialect:
-    """What must be known of a protocol: where a request ends, what makes two the same, how an answer is given anew."""
-
-    def __init__(self, end: bytes) -> None:
-        self._end = end
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """The whole requests in ``data``, and what is left."""
-        *whole, rest = data.split(self._end)
-        return [request + self._end for request in whole], rest
-
-    def key(self, request: bytes) -> bytes:
-        """What two requests have in common that ask the same."""
-        return request
-
-    def alike(self, then: bytes, now: bytes) -> bool:
-        """Whether a command with the key ``now`` is that which had the key ``then``."""
-        return then == now
-
-    def replaces(self, earlier: bytes, later: bytes) -> bool:
-        """Whether a command with the key ``later`` takes the place of one with the key ``earlier``."""
-        return False
-
-    def anew(self, exchange: Exchange, request: bytes) -> tuple[tuple[float, bytes], ...]:
-        """The answers of ``exchange``, given to ``request``."""
-        return exchange.answers
-
-
-class _Zaber(Dialect):
-    """Requests are numbered, and the answer bears the number; both may end in a checksum."""
-
-    def key(self, request: bytes) -> bytes:
-        match = _ZABER.fullmatch(request)
-        return request if match is None else match[1] + b" " + match[3]
-
-    def alike(self, then: bytes, now: bytes) -> bool:
-        one, other = _ZABER_MOTION.fullmatch(then), _ZABER_MOTION.fullmatch(now)
-        if one is None or other is None:
-            return then == now
-        return one[1] == other[1] and abs(int(one[2]) - int(other[2])) <= NEAR_STEPS
-
-    def replaces(self, earlier: bytes, later: bytes) -> bool:
-        return _ZABER_MOTION.fullmatch(earlier) is not None and _ZABER_HALT.fullmatch(later) is not None
-
-    def anew(self, exchange: Exchange, request: bytes) -> tuple[tuple[float, bytes], ...]:
-        then, now = _ZABER.fullmatch(exchange.request.data), _ZABER.fullmatch(request)
-        if then is None or now is None or not exchange.answers:
-            return exchange.answers
-
-        def renumber(match: re.Match[bytes]) -> bytes:
-            number = now[2] if match[2] == then[2] else match[2]
-            text = match[1] + b" " + number + match[3]
-            return b"@" + text + (b":%02X" % (-sum(text) & 0xFF) if match[4] else b"") + b"\r\n"
-
-        whole = b"".join(data for _, data in exchange.answers)
-        return ((exchange.answers[-1][0], _ZABER_REPLY.sub(renumber, whole)),)
-
-
-class _GSV8(Dialect):
-    """Requests say how long they are."""
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        whole = []
-        while len(data) > 1 and len(data) >= (length := _GSV8_HEAD + 1 + (data[1] & 0x0F)):
-            whole.append(data[:length])
-            data = data[length:]
-        return whole, data
-
-
-class _Frames(Dialect):
-    """CAN frames come one by one."""
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        return [data], b""
-
-
-DIALECTS: dict[str, Dialect] = {
-    "zaber": _Zaber(b"\n"),
-    "gsv8": _GSV8(b""),
-    "keyence-lkg": Dialect(b"\r"),
-    "shvps": Dialect(b"\r"),
-    "iseg-edcp": _Frames(b""),
-    "cia404": _Frames(b""),
-}
 
 
 class Lag:

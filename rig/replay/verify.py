@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from drivers.links.link import DeviceError
 from drivers.roles import HVSupply, Stage
+from drivers.settings import CanSettings
 from rig.bench.bench import Bench
 from rig.bench.opening import open_memory
 from rig.log import schema
 from rig.log.recorder import Recorder
 from rig.protocol.experiment import gains_of
 from rig.replay.recording import Recording, Row, numbers
-from rig.scene.scene import CanTable, Scene
+from rig.scene.scene import Scene
 from rig.sim.wire import ByteWire, Frame, FrameWire
 
 if TYPE_CHECKING:
@@ -147,7 +148,7 @@ class _Desk:
 
     def __init__(self, scene: Scene) -> None:
         self.wires = {
-            role: _FedFrameWire() if isinstance(table, CanTable) else _FedByteWire()
+            role: _FedFrameWire() if isinstance(table, CanSettings) else _FedByteWire()
             for role, table in scene.instruments.items()
         }
 

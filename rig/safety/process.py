@@ -28,10 +28,11 @@ import click
 
 from drivers.links.link import DeviceError
 from drivers.roles import HVSample, HVSupply
+from drivers.settings import SupplySettings
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, LimitError
 from rig.base.host import HostTime
-from rig.bench.devices import ROLE, Link, SupplyTable, make_supply, open_link
+from rig.bench.devices import ROLE, Link, make_supply
 from rig.log.errors import LogError
 from rig.log.recorder import Severity
 from rig.log.remote import RemoteLog
@@ -83,7 +84,7 @@ def serve(end: socket.socket, configured: bytes) -> None:
     scene = Scene.model_validate(known["scene"])
     assert scene.hv is not None
     try:
-        link = open_link(ROLE, scene.hv)
+        link = scene.hv.open(ROLE)
     except Exception as error:
         channel.send({"is": "error", "error": pack_error(error)})
         return
@@ -110,7 +111,7 @@ def _detach() -> None:
 class Server:
     """Runs the guard's loop until the engine closes the channel and the output has been taken care of."""
 
-    def __init__(self, scene: Scene, table: SupplyTable, link: Link, channel: Channel, clock: RealClock) -> None:
+    def __init__(self, scene: Scene, table: SupplySettings, link: Link, channel: Channel, clock: RealClock) -> None:
         self._scene = scene
         self._table = table
         self._link = link

@@ -20,16 +20,17 @@ from typing import Any
 
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, HVSupply, Identity, Sample
+from drivers.settings import CanSettings
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, LimitError, RigError, StaleData
-from rig.bench.devices import ROLE, Link, make_supply, open_link
+from rig.bench.devices import ROLE, Link, make_supply
 from rig.bench.tap import Tap
 from rig.log.recorder import Severity
 from rig.safety import process
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
-from rig.scene.scene import IsegTable, Scene
+from rig.scene.scene import Scene
 
 START_S = 30.0  # until the process must have opened the link; a slow disk has many modules to read
 ANSWER_S = 1.0  # a guard that takes longer to answer is lost
@@ -80,7 +81,7 @@ class RemoteGuard:
         self._successor: tuple[HVSupply, Guard] | None = None
         self._next_open = -math.inf
         self._link: Link | None = None
-        if isinstance(self._table, IsegTable):
+        if isinstance(self._table, CanSettings):
             import can  # noqa: F401  # so that it need not be read from disk when the guard has been lost
         self._start()
 
@@ -345,7 +346,7 @@ class RemoteGuard:
             return
         self._next_open = self._clock.now() + OPEN_AGAIN_S
         try:
-            self._link = open_link(ROLE, self._table)
+            self._link = self._table.open(ROLE)
             supply = make_supply(self._table, self._link, self._tap, self._clock.now)
             limits = Limits.of(self._scene)
             film = FilmLimits(self._scene.specimen.specimen(), limits)

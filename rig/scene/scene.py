@@ -10,90 +10,18 @@ from __future__ import annotations
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from drivers.links.can_link import SHARED
-from model.material.materials import NAMED, Material
-from model.specimen import Specimen
+from drivers.settings import CanSettings, InstrumentSettings, Positive
 from rig.base.errors import ConfigError
 from rig.base.table import Table
 from rig.base.toml_file import load_table, validate
+from rig.scene.instruments import AnyDisplacement, AnyForce, AnyStage, AnySupply
+from rig.scene.specimen import SpecimenTable
 from rig.sim.settings import TWINS, SimulationSettings
-
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-
-
-class MaterialTable(Table):
-    """Ogden terms in the convention W = sum mu_n/alpha_n (l1^a + l2^a + (l1 l2)^-a - 3), and the permittivity."""
-
-    mu_Pa: list[float] = Field(min_length=1, max_length=6)
-    alpha: list[float] = Field(min_length=1, max_length=6)
-    eps_r: float = Field(default=1.0, ge=1.0)
-    breakdown_V_per_um: Positive | None = None
-    max_stretch: float | None = Field(default=None, gt=1.0)
-    source: str = ""
-
-    @model_validator(mode="after")
-    def _same_length(self) -> Self:
-        if len(self.mu_Pa) != len(self.alpha):
-            raise ValueError(f"mu_Pa has {len(self.mu_Pa)} terms and alpha {len(self.alpha)}; they must pair up")
-        self.material("here")  # whatever else the model refuses
-        return self
-
-    def material(self, name: str) -> Material:
-        """The same in SI units."""
-        field = None if self.breakdown_V_per_um is None else self.breakdown_V_per_um * 1e6
-        return Material(
-            name=name,
-            mu=tuple(self.mu_Pa),
-            alpha=tuple(self.alpha),
-            eps_r=self.eps_r,
-            breakdown_field=field,
-            max_stretch=self.max_stretch,
-            source=self.source,
-        )
-
-
-class SpecimenTable(Table):
-    """The film as mounted. The material is what is believed of it: it plans and guards, the fit starts from it."""
-
-    name: str = Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")
-    disk_radius_mm: Positive
-    ring_radius_mm: Positive
-    thickness_um: Positive
-    prestretch: float = Field(ge=1.0, le=6.0)
-    material: str | MaterialTable
-    # Standard uncertainties of the dimensions; at 0 the results are stated for the dimensions as given.
-    disk_radius_uncertainty_mm: NotNegative = 0.0
-    thickness_uncertainty_um: NotNegative = 0.0
-    prestretch_uncertainty: NotNegative = 0.0
-    eccentricity_mm: NotNegative = 0.0  # how far the disk may sit off the ring's centre
-
-    @model_validator(mode="after")
-    def _sensible(self) -> Self:
-        if not self.disk_radius_mm < self.ring_radius_mm:
-            raise ValueError("disk_radius_mm must be smaller than ring_radius_mm")
-        if not self.eccentricity_mm < self.ring_radius_mm - self.disk_radius_mm:
-            raise ValueError("eccentricity_mm must be smaller than the gap between disk and ring")
-        if isinstance(self.material, str) and self.material not in NAMED:
-            raise ValueError(f"material {self.material!r} is not known; known are {', '.join(sorted(NAMED))}")
-        return self
-
-    def specimen(self) -> Specimen:
-        """The specimen in SI units."""
-        known = self.material
-        material = NAMED[known] if isinstance(known, str) else known.material(f"{self.name} (scene)")
-        return Specimen(
-            disk_radius=self.disk_radius_mm * 1e-3,
-            ring_radius=self.ring_radius_mm * 1e-3,
-            thickness=self.thickness_um * 1e-6,
-            prestretch=self.prestretch,
-            material=material,
-            name=self.name,
-        )
 
 
 class LimitsTable(Table):
@@ -110,123 +38,6 @@ class LimitsTable(Table):
     leakage_uA: Positive = 2.0  # beside the current that charges the film; more in two samples running is a breakdown
 
 
-class SerialTable(Table):
-    """What every instrument on a serial port has."""
-
-    port: str | None = Field(default=None, min_length=1)
-    timeout_s: float = Field(default=0.25, gt=0, le=10)
-    serial: str | None = None
-    certificate: str | None = None
-
-
-class ZaberTable(SerialTable):
-    """A Zaber stage on its ASCII protocol."""
-
-    driver: Literal["zaber"]
-    baud: int = Field(default=115200, gt=0)
-    device: int = Field(default=1, ge=1, le=99)
-    axis: int = Field(default=1, ge=1, le=9)
-    poll_rate_Hz: float = Field(default=50.0, ge=5, le=200)
-    full_step_um: Positive = 31.75  # travel per full motor step: screw pitch over steps a turn, 6.35 mm / 200
-    approach_from_mm: float = Field(default=0.0, ge=0)  # stage position, short of the film, where approaching begins
-
-
-class GSV8Table(SerialTable):
-    """An ME-Messsysteme GSV-8 with a strain-gauge force sensor; its certificate turns mV/V into newtons."""
-
-    driver: Literal["gsv8"]
-    baud: int = Field(default=230400, gt=0)
-    channel: int = Field(default=1, ge=1, le=8)
-    rate_Hz: float = Field(default=100.0, gt=0, le=2000)
-    frame_type: Literal["float32", "int24", "int16"] = "float32"
-    # Float values are the signal in input ranges times the amplifier's user scale ("range"), or the signal in mV/V
-    # times it. Integers reach their end at int_full_scale input ranges. The range itself is asked of the amplifier
-    # unless it is given here.
-    user_scale_of: Literal["range", "mV/V"] = "range"
-    int_full_scale: float = Field(default=1.05, ge=0.5, le=2)
-    input_range_mV_per_V: float | None = Field(default=None, gt=0, le=1000)
-    certificate: str
-
-
-class KeyenceTable(SerialTable):
-    """A Keyence LK-G laser displacement sensor on RS-232."""
-
-    driver: Literal["keyence-lkg"]
-    baud: int = Field(default=115200, gt=0)
-    output: int = Field(default=1, ge=1, le=2)
-    poll_rate_Hz: float = Field(default=50.0, ge=5, le=200)
-    unit_mm: Positive = 1.0  # of the controller's display: 0.001 when it is set to micrometres
-    limit_mm: Positive = 80.0  # what the head can show at most; more is not believed
-
-
-class ShvpsTable(SerialTable):
-    """The shvps supply of dielectric-elastomer labs on a serial port. Whole volts; it does not measure its current."""
-
-    measures_current: ClassVar[bool] = False
-    whole_volts: ClassVar[bool] = True
-    driver: Literal["shvps"]
-    baud: int = Field(default=115200, gt=0)
-    ramp_V_per_s: Positive = 100.0
-    parallel_capacitance_nF: NotNegative = 0.0  # of cable and output, beside the film
-    poll_rate_Hz: float = Field(default=10.0, gt=0, le=20)
-
-
-class CanTable(Table):
-    """What every instrument on a CAN bus has."""
-
-    interface: Literal["slcan", "socketcan", "pcan", "vector", "virtual", "udp_multicast"] | None = None
-    can_channel: str | None = None
-    bitrate: int = Field(default=125_000, gt=0)
-    timeout_s: float = Field(default=0.25, gt=0, le=10)
-    serial: str | None = None
-    certificate: str | None = None
-
-    @model_validator(mode="after")
-    def _pair(self) -> Self:
-        if (self.interface is None) != (self.can_channel is None):
-            raise ValueError("interface and can_channel belong together: give both or neither")
-        return self
-
-
-class CiA404Table(CanTable):
-    """A load cell on CANopen by device profile CiA 404; its certificate corrects the newtons that it states."""
-
-    driver: Literal["cia404"]
-    node: int = Field(default=1, ge=1, le=127)
-    channel: int = Field(default=1, ge=1, le=199)
-    rate_Hz: float = Field(default=100.0, gt=0, le=1000)
-    # For a device that states neither newtons nor mV/V: what its values are, once multiplied by the factor.
-    unit: Literal["N", "mV/V"] | None = None
-    factor: float = 1.0
-    limit_N: Positive = 1e4  # no larger reading is believed; set it to some times the capacity of the cell
-    certificate: str
-
-    @model_validator(mode="after")
-    def _factor_has_a_unit(self) -> Self:
-        if self.unit is None and self.factor != 1.0:
-            raise ValueError("factor is given without unit: say what the values are, multiplied by it")
-        if self.factor == 0.0:
-            raise ValueError("factor must not be 0")
-        return self
-
-
-class IsegTable(CanTable):
-    """One channel of an iseg supply that speaks EDCP on CAN."""
-
-    measures_current: ClassVar[bool] = True
-    whole_volts: ClassVar[bool] = False
-    driver: Literal["iseg-edcp"]
-    module: int = Field(default=0, ge=0, le=63)
-    channel: int = Field(default=0, ge=0, le=23)
-    ramp_V_per_s: Positive = 100.0
-    parallel_capacitance_nF: NotNegative = 0.0  # of cable and output, beside the film
-    max_ramp_percent_per_s: float = Field(default=20.0, gt=0, le=100)  # of nominal; what the module takes at most
-    poll_rate_Hz: float = Field(default=10.0, gt=0, le=50)
-
-
-Instrument = ZaberTable | GSV8Table | CiA404Table | KeyenceTable | IsegTable | ShvpsTable
-
-
 class BenchTable(Table):
     """A log in place of the instruments: it answers what it was asked when it was recorded, and nothing else."""
 
@@ -240,10 +51,10 @@ class Scene(Table):
     title: str = ""
     specimen: SpecimenTable
     limits: LimitsTable
-    stage: ZaberTable
-    force: Annotated[GSV8Table | CiA404Table, Field(discriminator="driver")]
-    displacement: KeyenceTable | None = None
-    hv: Annotated[IsegTable | ShvpsTable, Field(discriminator="driver")] | None = None
+    stage: AnyStage
+    force: AnyForce
+    displacement: AnyDisplacement | None = None
+    hv: AnySupply | None = None
     simulation: SimulationSettings | None = None
     bench: BenchTable | None = None
 
@@ -262,7 +73,7 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
-        named = [role for role, table in self.instruments.items() if is_connected(table)]
+        named = [role for role, table in self.instruments.items() if table.connected]
         if named and len(named) < len(self.instruments):
             missing = [role for role in self.instruments if role not in named]
             raise ValueError(f"{', '.join(named)} has a port but {', '.join(missing)} has none; name all or none")
@@ -285,7 +96,7 @@ class Scene(Table):
         return self
 
     def _check_buses(self) -> None:
-        buses = {role: table for role, table in self.instruments.items() if isinstance(table, CanTable)}
+        buses = {role: table for role, table in self.instruments.items() if isinstance(table, CanSettings)}
         for (one, first), (other, second) in combinations(buses.items(), 2):
             if first.interface is None or (first.interface, first.can_channel) != (
                 second.interface,
@@ -315,7 +126,7 @@ class Scene(Table):
             )
 
     @cached_property
-    def instruments(self) -> dict[str, Instrument]:
+    def instruments(self) -> dict[str, InstrumentSettings]:
         """The instruments that the scene names, by role, in the order in which they are polled."""
         tables = {"stage": self.stage, "force": self.force, "displacement": self.displacement, "hv": self.hv}
         return {role: table for role, table in tables.items() if table is not None}
@@ -323,15 +134,12 @@ class Scene(Table):
     @property
     def rates(self) -> dict[str, float]:
         """How often each instrument is to give a sample (Hz), by role."""
-        return {
-            role: table.rate_Hz if isinstance(table, GSV8Table | CiA404Table) else table.poll_rate_Hz
-            for role, table in self.instruments.items()
-        }
+        return {role: table.sample_rate for role, table in self.instruments.items()}
 
     @property
     def on_real_ports(self) -> bool:
         """True when the instruments are reached through ports, False for the simulated bench in memory."""
-        return is_connected(self.stage)
+        return self.stage.connected
 
     def with_ports(self, ports: dict[str, dict[str, Any]]) -> Scene:
         """The same scene with the ports that ``dea-rig sim`` printed.
@@ -347,11 +155,6 @@ class Scene(Table):
                 raise ConfigError(f"The ports name no {role!r}; they name {', '.join(sorted(ports)) or 'nothing'}.")
             raw[role].update(ports[role])
         return validate(raw, Scene, "scene", "scene with these ports")
-
-
-def is_connected(table: Table) -> bool:
-    """Whether this instrument's table names a port or bus."""
-    return getattr(table, "port", None) is not None or getattr(table, "interface", None) is not None
 
 
 def load_scene(path: Path) -> tuple[Scene, str]:

@@ -13,7 +13,7 @@ canopen = pytest.importorskip("canopen", reason="needs the conformance dependenc
 
 from canopen import objectdictionary as od  # noqa: E402
 
-from drivers.instruments.cia404 import CiA404  # noqa: E402
+from drivers.instruments.cia404.device import CiA404  # noqa: E402
 from drivers.links.can_link import CanLink  # noqa: E402
 from drivers.links.link import DeviceRefused  # noqa: E402
 from drivers.roles import SampleFlag  # noqa: E402

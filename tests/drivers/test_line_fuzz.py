@@ -16,7 +16,8 @@ from typing import Any
 
 import pytest
 
-from drivers.instruments import keyence_lkg, shvps, zaber
+from drivers.instruments import keyence_lkg, shvps
+from drivers.instruments.zaber import codec as zaber
 
 BATCH = 100  # lines in one stream, every other one with damage of its own
 POOL = 4000

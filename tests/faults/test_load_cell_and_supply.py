@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from drivers.instruments.gsv8 import GSV8
-from drivers.instruments.iseg_edcp import IsegEDCP
+from drivers.instruments.gsv8.device import GSV8
+from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.links.link import DeviceError, DeviceSilent
 from drivers.roles import ForceSample, HVFlag, HVSample, SampleFlag
 from model.material.materials import NAMED

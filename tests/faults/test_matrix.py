@@ -19,12 +19,12 @@ from typing import Any
 
 import pytest
 
-from drivers.instruments.cia404 import CiA404
-from drivers.instruments.gsv8 import GSV8
-from drivers.instruments.iseg_edcp import IsegEDCP
+from drivers.instruments.cia404.device import CiA404
+from drivers.instruments.gsv8.device import GSV8
+from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.instruments.keyence_lkg import KeyenceLKG
 from drivers.instruments.shvps import Shvps
-from drivers.instruments.zaber import ZaberStage
+from drivers.instruments.zaber.device import ZaberStage
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import (
     DisplacementSample,

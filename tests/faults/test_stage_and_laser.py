@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import pytest
 
 from drivers.instruments.keyence_lkg import KeyenceLKG
-from drivers.instruments.zaber import ZaberStage
+from drivers.instruments.zaber.device import ZaberStage
 from drivers.links.link import DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import DisplacementSample, SampleFlag, StageSample
 from model.material.materials import NAMED

@@ -25,7 +25,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from drivers.instruments.iseg_edcp import IsegEDCP
+from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.links.link import DeviceError
 from model.membrane.solve import Solution, solve
 from rig.base.clock import VirtualClock

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.instruments import cia404
-from drivers.instruments.cia404 import CiA404, Decoder, Entry, Layout
+from drivers.instruments.cia404 import codec as cia404
+from drivers.instruments.cia404.codec import Decoder, Entry, Layout
+from drivers.instruments.cia404.device import CiA404
 from drivers.links.link import CanFrame, DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import ForceSample, ForceSensor, SampleFlag
 

@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.instruments import gsv8
-from drivers.instruments.gsv8 import GSV8, Decoder, Measured, Reply, encode
+from drivers.instruments.gsv8 import codec as gsv8
+from drivers.instruments.gsv8.codec import Decoder, Measured, Reply, encode
+from drivers.instruments.gsv8.device import GSV8
 from drivers.links.link import DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import ForceSample, ForceSensor, SampleFlag
 

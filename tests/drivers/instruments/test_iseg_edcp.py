@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.instruments import iseg_edcp as edcp
-from drivers.instruments.iseg_edcp import ChannelEvents, ChannelStatus, IsegEDCP, ModuleStatus
+from drivers.instruments.iseg_edcp import codec as edcp
+from drivers.instruments.iseg_edcp.codec import ChannelEvents, ChannelStatus, ModuleStatus
+from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.links.link import CanFrame, DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, HVSupply
 

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import roles
-from drivers.instruments.zaber import WARNINGS, Alert, Codec, Info, Message, Reply, ZaberStage, checksum, encode
+from drivers.instruments.zaber.codec import WARNINGS, Alert, Codec, Info, Message, Reply, checksum, encode
+from drivers.instruments.zaber.device import ZaberStage
 from drivers.links.link import DeviceLost, DeviceRefused, DeviceSilent
 
 STEP = 0.49609375e-6  # 6.35 mm / 200 / 64

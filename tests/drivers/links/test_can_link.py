@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
-from drivers.instruments.iseg_edcp import IsegEDCP
+from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.links.can_link import INTERFACES, CanLink
 from drivers.links.link import CanFrame, DeviceError, DeviceLost, DeviceRefused, FrameLink
 

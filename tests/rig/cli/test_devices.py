@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 from rig.base.clock import RealClock
 from rig.base.toml_file import validate
-from rig.bench.devices import make_supply, open_link
+from rig.bench.devices import make_supply
 from rig.cli.app import main
 from rig.run.backend import open_bench, simulated_bench
 from rig.scene.scene import Scene, load_scene
@@ -114,7 +114,7 @@ def test_the_lines_proposed_are_a_scene_on_which_every_instrument_answers(
     rest = {"specimen": known["specimen"], "limits": limits, **{r: t for r, t in proposed.items() if r != "hv"}}
     with (
         closing(open_bench(validate(rest, Scene, "scene", "proposed"))) as bench,
-        closing(open_link("hv", whole.hv)) as link,
+        closing(whole.hv.open("hv")) as link,
     ):
         bench.attach(lambda *told: None)
         found = dict(bench.devices) | {"hv": make_supply(whole.hv, link, lambda *told: None, bench.clock.now)}

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.instruments.gsv8 import Decoder, Measured
+from drivers.instruments.gsv8.codec import Decoder, Measured
 from rig.benchmark.rates import FORCE_HZ, scene_text
 from rig.log.reader import read_log
 from rig.log.recover import recover

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from drivers.instruments.zaber import ZaberStage
+from drivers.instruments.zaber.device import ZaberStage
 from rig.base.errors import ConfigError
 from rig.benchmark.fixtures import LOGS
 from rig.cli.app import main

@@ -8,12 +8,17 @@ from dataclasses import replace
 
 import pytest
 
-import drivers.instruments.cia404
-import drivers.instruments.gsv8
-import drivers.instruments.iseg_edcp
+import drivers.instruments.cia404.codec
+import drivers.instruments.cia404.device
+import drivers.instruments.gsv8.codec
+import drivers.instruments.gsv8.device
+import drivers.instruments.iseg_edcp.codec
+import drivers.instruments.iseg_edcp.device
 import drivers.instruments.keyence_lkg
 import drivers.instruments.shvps
-import drivers.instruments.zaber
+import drivers.instruments.zaber.codec
+import drivers.instruments.zaber.device
+import drivers.roles
 from rig.replay.verify import verify
 
 
@@ -23,54 +28,56 @@ def received(recording, role):
 
 
 def zaber_sign(patch):
-    read = drivers.instruments.zaber.ZaberStage._whole
-    patch.setattr(drivers.instruments.zaber.ZaberStage, "_whole", lambda self, reply, words: -read(self, reply, words))
+    read = drivers.instruments.zaber.device.ZaberStage._whole
+    patch.setattr(
+        drivers.instruments.zaber.device.ZaberStage, "_whole", lambda self, reply, words: -read(self, reply, words)
+    )
 
 
 def zaber_scale(patch):
     patch.setattr(
-        drivers.instruments.zaber.ZaberStage,
+        drivers.instruments.zaber.device.ZaberStage,
         "_whole",
         lambda self, reply, words: int(reply.data) + (words == "get pos"),
     )
 
 
 def zaber_moving(patch):
-    patch.setattr(drivers.instruments.zaber.ZaberStage, "moving", property(lambda self: False))
+    patch.setattr(drivers.instruments.zaber.device.ZaberStage, "moving", property(lambda self: False))
 
 
 def gsv8_byte_order(patch):
-    patch.setattr(drivers.instruments.gsv8, "struct", ByteOrder(">", "<", "f"))
+    patch.setattr(drivers.instruments.gsv8.codec, "struct", ByteOrder(">", "<", "f"))
 
 
 def gsv8_wrong_width(patch):
-    patch.setitem(drivers.instruments.gsv8._WIDTH, "float32", 3)
-    patch.setattr(drivers.instruments.gsv8, "struct", ByteOrder(">", "<", "f"))
+    patch.setitem(drivers.instruments.gsv8.codec.WIDTH, "float32", 3)
+    patch.setattr(drivers.instruments.gsv8.codec, "struct", ByteOrder(">", "<", "f"))
 
 
 def gsv8_failing(patch):
     patch.setattr(
-        drivers.instruments.gsv8.Decoder, "_parse", lambda self, buffer, at, length: struct.unpack(">f", buffer)
+        drivers.instruments.gsv8.codec.Decoder, "_parse", lambda self, buffer, at, length: struct.unpack(">f", buffer)
     )
 
 
 def gsv8_sign(patch):
-    sample = drivers.instruments.gsv8.GSV8._sample
+    sample = drivers.instruments.gsv8.device.GSV8._sample
     patch.setattr(
-        drivers.instruments.gsv8.GSV8,
+        drivers.instruments.gsv8.device.GSV8,
         "_sample",
         lambda self, frame: replace(s := sample(self, frame), reading=-s.reading),
     )
 
 
 def gsv8_last_digit(patch):
-    sample = drivers.instruments.gsv8.GSV8._sample
+    sample = drivers.instruments.gsv8.device.GSV8._sample
 
     def wrong(self, frame):
         right = sample(self, frame)
         return replace(right, reading=math.nextafter(right.reading, math.inf))
 
-    patch.setattr(drivers.instruments.gsv8.GSV8, "_sample", wrong)
+    patch.setattr(drivers.instruments.gsv8.device.GSV8, "_sample", wrong)
 
 
 def keyence_sign(patch):
@@ -86,44 +93,44 @@ def keyence_scale(patch):
 
 
 def iseg_byte_order(patch):
-    patch.setattr(drivers.instruments.iseg_edcp, "struct", ByteOrder(">", "<", "f"))
+    patch.setattr(drivers.instruments.iseg_edcp.codec, "struct", ByteOrder(">", "<", "f"))
 
 
 def iseg_flags(patch):
     patch.setattr(
-        drivers.instruments.iseg_edcp,
+        drivers.instruments.iseg_edcp.device,
         "hv_flags",
-        lambda status, events, module: drivers.instruments.iseg_edcp.HVFlag(0),
+        lambda status, events, module: drivers.roles.HVFlag(0),
     )
 
 
 def iseg_scale(patch):
-    feed = drivers.instruments.iseg_edcp.Decoder.feed
+    feed = drivers.instruments.iseg_edcp.codec.Decoder.feed
 
     def wrong(self, frame):
         message = feed(self, frame)
         if (
-            isinstance(message, drivers.instruments.iseg_edcp.Data)
-            and message.item is drivers.instruments.iseg_edcp.MEASURED_CURRENT
+            isinstance(message, drivers.instruments.iseg_edcp.codec.Data)
+            and message.item is drivers.instruments.iseg_edcp.codec.MEASURED_CURRENT
         ):
             return replace(message, value=message.value * 1e-3)
         return message
 
-    patch.setattr(drivers.instruments.iseg_edcp.Decoder, "feed", wrong)
+    patch.setattr(drivers.instruments.iseg_edcp.codec.Decoder, "feed", wrong)
 
 
 def cia404_sign(patch):
-    take = drivers.instruments.cia404.Layout.take
+    take = drivers.instruments.cia404.codec.Layout.take
 
     def wrong(self, data):
         value, status = take(self, data)
         return -value, status
 
-    patch.setattr(drivers.instruments.cia404.Layout, "take", wrong)
+    patch.setattr(drivers.instruments.cia404.codec.Layout, "take", wrong)
 
 
 def cia404_byte_order(patch):
-    patch.setattr(drivers.instruments.cia404, "struct", ByteOrder("<", ">", "f"))
+    patch.setattr(drivers.instruments.cia404.codec, "struct", ByteOrder("<", ">", "f"))
 
 
 def shvps_off_by_one(patch):
@@ -203,13 +210,13 @@ def test_the_offset_is_that_of_the_frame(recorded, monkeypatch):
     frames = [row.fields["data"] for row in recording.rows if row.topic == "/raw/force/rx"]
     wrong = next(frame for frame in frames[800:] if len(frame) == 36 and stream.count(frame) == 1)
     value = struct.unpack(">f", wrong[3:7])[0]
-    sample = drivers.instruments.gsv8.GSV8._sample
+    sample = drivers.instruments.gsv8.device.GSV8._sample
 
     def broken(self, frame):
         right = sample(self, frame)
         return replace(right, reading=right.reading + 1e-9) if frame.values[0] == value else right
 
-    monkeypatch.setattr(drivers.instruments.gsv8.GSV8, "_sample", broken)
+    monkeypatch.setattr(drivers.instruments.gsv8.device.GSV8, "_sample", broken)
     difference = verify(recording).difference
     at = stream.find(wrong)
     assert difference.offset <= at

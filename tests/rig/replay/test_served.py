@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.instruments.zaber import Codec, Reply, encode
-from rig.replay.served import DIALECTS, Lag, Passed, ServedScript
+from drivers.instruments.zaber.codec import Codec, Reply, encode
+from drivers.recorded import Passed
+from drivers.registry import registered
+from rig.replay.served import Lag, ServedScript
 
 
 class Departed(Exception):
     pass
+
+
+DIALECTS = {one.driver: one.dialect for one in registered().instruments.values()}
 
 
 def script(rows, driver="zaber", lag=None):

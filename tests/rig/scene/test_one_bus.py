@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.instruments.cia404 import CiA404
-from drivers.instruments.iseg_edcp import IsegEDCP
+from drivers.instruments.cia404.device import CiA404
+from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.links.can_link import CanLink
 from drivers.links.link import CanFrame, DeviceError
 from drivers.roles import ForceSample, HVSample

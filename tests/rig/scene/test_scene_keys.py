@@ -7,43 +7,29 @@ from contextlib import closing, contextmanager
 from importlib.resources import files
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from drivers.instruments.cia404 import CiA404
-from drivers.instruments.gsv8 import GSV8
-from drivers.instruments.iseg_edcp import IsegEDCP
-from drivers.instruments.keyence_lkg import KeyenceLKG
-from drivers.instruments.shvps import Shvps
-from drivers.instruments.zaber import ZaberStage
+from drivers.instrument import Instrument
 from drivers.links.link import DeviceRefused
+from drivers.registry import registered
 from drivers.roles import Sample
 from rig.base.toml_file import parse_table
 from rig.bench.bench import Bench
-from rig.bench.devices import arguments
 from rig.run.backend import open_bench
-from rig.scene.scene import CiA404Table, GSV8Table, IsegTable, KeyenceTable, Scene, ShvpsTable, ZaberTable
+from rig.scene.scene import Scene
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
-DRIVERS = {
-    ZaberTable: ZaberStage,
-    GSV8Table: GSV8,
-    CiA404Table: CiA404,
-    KeyenceTable: KeyenceLKG,
-    IsegTable: IsegEDCP,
-    ShvpsTable: Shvps,
-}
 NOT_IN_A_SCENE = {"poll_interval_s"}  # how the driver works, no fact of the instrument
 
 
-@pytest.mark.parametrize("table", DRIVERS)
-def test_every_argument_of_a_driver_is_a_key_of_the_scene(table: Any) -> None:
-    driver: Any = DRIVERS[table]
-    named = {name for name, one in signature(driver).parameters.items() if one.kind is Parameter.KEYWORD_ONLY}
+@pytest.mark.parametrize("one", registered().instruments.values(), ids=lambda one: one.driver)
+def test_every_argument_of_a_driver_is_a_key_of_the_scene(one: Instrument) -> None:
+    driver, table = one.device, one.settings
+    named = {name for name, key in signature(driver).parameters.items() if key.kind is Parameter.KEYWORD_ONLY}
     assert named - NOT_IN_A_SCENE <= set(table.model_fields)
     given = table.model_construct(driver="", certificate="", port=None, baud=1, bitrate=1)
-    assert set(arguments(given, driver)) == named - NOT_IN_A_SCENE
+    assert set(one.arguments(given)) == named - NOT_IN_A_SCENE
     # What holds when a scene does not say otherwise is the same as in the driver: one place could not be found.
     for name in named - NOT_IN_A_SCENE - {"poll_rate_Hz", "timeout_s", "ramp_V_per_s"}:
         assert table.model_fields[name].default == signature(driver).parameters[name].default, name

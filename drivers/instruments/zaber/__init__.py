@@ -1,0 +1,101 @@
+"""Zaber linear stages (X-LSQ and relatives) on the ASCII protocol: keys in a scene, how one is found and replayed."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.instrument import Instrument
+from drivers.instruments.zaber.codec import Codec, Reply, checksum, encode
+from drivers.instruments.zaber.device import ZaberStage
+from drivers.probe import Answered, Line, SerialProbe
+from drivers.recorded import Dialect, Exchange
+from drivers.roles import Identity
+from drivers.settings import Positive, SerialSettings, StageSettings
+
+NEAR_STEPS = 20
+"""By which the place of a motion may differ when a log is served, about 10 um: it follows from readings."""
+
+_REQUEST = re.compile(rb"/(\d+ \d+) (\d+) ?([^:\n]*)(?::[0-9A-F]{2})?\r?\n")
+_REPLY = re.compile(rb"@(\d+ \d+) (\d+)([^:\r\n]*)(:[0-9A-F]{2})?\r\n")
+_MOTION = re.compile(rb"(\d+ \d+ move abs) (-?\d+)")
+_HALT = re.compile(rb"\d+ \d+ (?:stop|move abs -?\d+)")
+
+
+class ZaberSettings(StageSettings, SerialSettings):
+    """A Zaber stage on its ASCII protocol."""
+
+    driver: Literal["zaber"] = Field(description="Zaber stage, ASCII protocol on a serial port.")
+    device: int = Field(default=1, ge=1, le=99, description="Address of the device on the line.")
+    axis: int = Field(default=1, ge=1, le=9, description="Axis of the device; 1 for stages with a built-in controller.")
+    full_step_um: Positive = Field(
+        default=31.75,
+        description="Travel per full motor step (um): screw pitch over steps a turn. 31.75 is a 6.35 mm screw over 200 "
+        "steps (X-LSQ..B); the device does not state it.",
+    )
+
+
+def _ask(line: Line) -> list[Answered]:
+    codec = Codec()
+    replies = (m for m in line.ask(encode(0, 0, 0, ""), codec.feed) if isinstance(m, Reply))
+    return [_identified(line, codec, device) for device in sorted({reply.device for reply in replies if reply.id == 0})]
+
+
+def _identified(line: Line, codec: Codec, device: int) -> Answered:
+    answers = []
+    for number, words in enumerate(("get deviceid", "get system.serial", "get version"), start=1):
+        expected = (device, 0, number)
+        answer = ""
+        for message in line.ask(encode(device, 0, number, words), codec.feed):
+            if isinstance(message, Reply) and (message.device, message.axis, message.id) == expected:
+                answer = message.data if message.accepted else ""
+                break
+        answers.append(answer)
+    device_id, serial, version = answers
+    return Answered(
+        Identity(f"Zaber device {device_id}".rstrip(), serial, version), {"serial": serial, "device": device}
+    )
+
+
+class NumberedLines(Dialect):
+    """Requests are numbered, and the answer bears the number; both may end in a checksum."""
+
+    def key(self, request: bytes) -> bytes:
+        match = _REQUEST.fullmatch(request)
+        return request if match is None else match[1] + b" " + match[3]
+
+    def alike(self, then: bytes, now: bytes) -> bool:
+        one, other = _MOTION.fullmatch(then), _MOTION.fullmatch(now)
+        if one is None or other is None:
+            return then == now
+        return one[1] == other[1] and abs(int(one[2]) - int(other[2])) <= NEAR_STEPS
+
+    def replaces(self, earlier: bytes, later: bytes) -> bool:
+        return _MOTION.fullmatch(earlier) is not None and _HALT.fullmatch(later) is not None
+
+    def anew(self, exchange: Exchange, request: bytes) -> tuple[tuple[float, bytes], ...]:
+        then, now = _REQUEST.fullmatch(exchange.request.data), _REQUEST.fullmatch(request)
+        if then is None or now is None or not exchange.answers:
+            return exchange.answers
+
+        def renumber(match: re.Match[bytes]) -> bytes:
+            number = now[2] if match[2] == then[2] else match[2]
+            text = match[1] + b" " + number + match[3]
+            return b"@" + text + (b":%02X" % checksum(text) if match[4] else b"") + b"\r\n"
+
+        whole = b"".join(data for _, data in exchange.answers)
+        return ((exchange.answers[-1][0], _REPLY.sub(renumber, whole)),)
+
+
+INSTRUMENTS = (
+    Instrument(
+        driver="zaber",
+        role="stage",
+        settings=ZaberSettings,
+        device=ZaberStage,
+        dialect=NumberedLines(b"\n"),
+        probe=SerialProbe(_ask, bauds=(115_200, 9_600), order=10),
+    ),
+)

@@ -1,0 +1,161 @@
+"""What a scene says of an instrument: the base of every instrument's table, with the keys that all have in common.
+
+An instrument declares its keys here once: name with unit, default, range and description. The scene's tables, the
+reference page (``dea-rig keys``), the editor's completion and the error messages are all made from them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+if TYPE_CHECKING:
+    from drivers.links.link import ByteLink, FrameLink
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Table(BaseModel):
+    """A TOML table: strict types, no unknown keys, no NaN or inf.
+
+    Keys carry their unit (``thickness_um``) and a description; lists are ``list``, never tuples.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class InstrumentSettings(Table):
+    """What every instrument has.
+
+    ``rate_key`` is the key that says how often it gives a sample. ``place_keys`` are the keys that name its port or
+    bus; without them it is looked for on the simulated bench.
+    """
+
+    rate_key: ClassVar[str] = "poll_rate_Hz"
+    place_keys: ClassVar[tuple[str, ...]] = ()
+
+    driver: str = Field(description="Which kind of instrument it is.")
+    timeout_s: float = Field(
+        default=0.25,
+        gt=0,
+        le=10,
+        description="How long to wait for each answer before it is asked again (s). Typical: 0.1 to 0.5.",
+    )
+    serial: str | None = Field(
+        default=None,
+        description="Serial number that the instrument must state, or the run is refused. Absent: any is taken.",
+    )
+    certificate: str | None = Field(
+        default=None,
+        description="Calibration certificate, a TOML file seen from the scene. Absent: its values are taken as stated.",
+    )
+
+    @property
+    def connected(self) -> bool:
+        """Whether a port or bus is named."""
+        return any(getattr(self, key) is not None for key in self.place_keys)
+
+    @property
+    def sample_rate(self) -> float:
+        """How often it is to give a sample (Hz)."""
+        return float(getattr(self, self.rate_key))
+
+    def open(self, name: str) -> ByteLink | FrameLink:
+        """Open the port or bus; sends nothing to the instrument. ``name`` is the instrument's in messages.
+
+        Raises
+        ------
+        drivers.links.link.DeviceError
+            It cannot be opened, or somebody else has it.
+        """
+        raise NotImplementedError
+
+
+class SerialSettings(InstrumentSettings):
+    """What every instrument on a serial port has."""
+
+    place_keys: ClassVar[tuple[str, ...]] = ("port",)
+
+    port: str | None = Field(
+        default=None,
+        min_length=1,
+        description='Serial port, e.g. "/dev/ttyUSB0" or "COM3"; `dea-rig devices` lists them. Absent: simulated.',
+    )
+    baud: int = Field(default=115_200, gt=0, description="Line rate (bit/s), as set in the instrument.")
+
+    def open(self, name: str) -> ByteLink:
+        from drivers.links.serial_link import SerialLink
+
+        assert self.port is not None
+        return SerialLink(name, self.port, self.baud)
+
+
+class CanSettings(InstrumentSettings):
+    """What every instrument on a CAN bus has."""
+
+    place_keys: ClassVar[tuple[str, ...]] = ("interface", "can_channel")
+
+    interface: Literal["slcan", "socketcan", "pcan", "vector", "virtual", "udp_multicast"] | None = Field(
+        default=None,
+        description="Kind of CAN adapter, as python-can names it. Absent: simulated.",
+    )
+    can_channel: str | None = Field(
+        default=None,
+        description='Which adapter of that kind, e.g. "can0" or "/dev/ttyACM0"; given together with interface.',
+    )
+    bitrate: int = Field(default=125_000, gt=0, description="Bit rate of the bus (bit/s), the same for all on it.")
+
+    @model_validator(mode="after")
+    def _pair(self) -> Self:
+        if (self.interface is None) != (self.can_channel is None):
+            raise ValueError("interface and can_channel belong together: give both or neither")
+        return self
+
+    def open(self, name: str) -> FrameLink:
+        from drivers.links.can_link import CanLink
+
+        assert self.interface is not None and self.can_channel is not None
+        return CanLink(name, self.interface, self.can_channel, self.bitrate)
+
+
+class StageSettings(InstrumentSettings):
+    """What every stage has."""
+
+    poll_rate_Hz: float = Field(
+        default=50.0, ge=5, le=200, description="How often the position is asked for (Hz). Typical: 50."
+    )
+    approach_from_mm: float = Field(
+        default=0.0,
+        ge=0,
+        description="Stage position (mm), short of the film, to which it goes fast and where the slow approach begins.",
+    )
+
+
+class ForceSettings(InstrumentSettings):
+    """What every force sensor has."""
+
+    rate_key: ClassVar[str] = "rate_Hz"
+
+    certificate: str = Field(
+        description="Calibration certificate of the load cell, a TOML file seen from the scene: gain, date, serial."
+    )
+
+
+class SupplySettings(InstrumentSettings):
+    """What every high-voltage supply has.
+
+    ``measures_current`` says whether it measures its output current and can limit it; ``whole_volts`` whether it takes
+    set-points in whole volts only.
+    """
+
+    measures_current: ClassVar[bool]
+    whole_volts: ClassVar[bool] = False
+
+    ramp_V_per_s: Positive = Field(
+        default=100.0, description="How fast the voltage is raised and lowered (V/s). Typical: 50 to 500."
+    )
+    parallel_capacitance_nF: NotNegative = Field(
+        default=0.0, description="Capacitance of cable and output beside the film (nF); it takes charging current too."
+    )
