@@ -44,7 +44,7 @@ from rig.run.run import Consent
 from rig.run.run import run as run_experiment
 from rig.scene.scene import Scene, load_scene
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import ForceTruth
+from rig.sim.instruments.gsv8 import GSV8Truth
 from rig.sim.wire import ByteWire
 
 if TYPE_CHECKING:
@@ -348,7 +348,7 @@ def _noise(scene: Scene) -> float:
     """Standard deviation of the noise, mV/V."""
     assert scene.simulation is not None
     truth = scene.simulation.force
-    assert isinstance(truth, ForceTruth)
+    assert isinstance(truth, GSV8Truth)
     return truth.noise_fraction * truth.sensitivity_mV_per_V
 
 

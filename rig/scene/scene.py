@@ -21,7 +21,9 @@ from rig.base.table import Table
 from rig.base.toml_file import load_table, validate
 from rig.scene.instruments import AnyDisplacement, AnyForce, AnyStage, AnySupply
 from rig.scene.specimen import SpecimenTable
-from rig.sim.settings import TWINS, SimulationSettings
+from rig.sim.settings import SimulationSettings
+from rig.sim.truth import ROLES
+from rig.sim.twins import of_role as twins_of_role
 
 
 class LimitsTable(Table):
@@ -65,9 +67,9 @@ class Scene(Table):
         if not isinstance(raw, dict) or not isinstance(raw.get("simulation"), dict):
             return raw
         simulation = dict(raw["simulation"])
-        for role, drivers in TWINS.items():
+        for role in ROLES:
             table, truth = raw.get(role), simulation.get(role, {})
-            if isinstance(table, dict) and isinstance(truth, dict) and table.get("driver") in drivers:
+            if isinstance(table, dict) and isinstance(truth, dict) and table.get("driver") in twins_of_role(role):
                 simulation[role] = {"driver": table["driver"], **truth}
         return raw | {"simulation": simulation}
 
@@ -81,10 +83,17 @@ class Scene(Table):
             raise ValueError(f"{', '.join(named)} has a port, but [bench] names a log in their place: leave one out")
         if not named and self.simulation is None and self.bench is None:
             raise ValueError("no instrument has a port and there is no [simulation] table: nothing to run on")
-        for role in TWINS:
-            table = self.instruments.get(role)
-            simulated = getattr(self.simulation, role, None)
-            if table is not None and simulated is not None and table.driver != simulated.driver:
+        for role, table in self.instruments.items():
+            if self.simulation is None:
+                break
+            simulated = self.simulation.truth(role)
+            if table.driver not in twins_of_role(role):
+                known = ", ".join(twins_of_role(role))
+                raise ValueError(
+                    f"{role}.driver is {table.driver!r}, which cannot be simulated (simulated can be {known}); name "
+                    "the ports and leave [simulation] out"
+                )
+            if table.driver != simulated.driver:
                 raise ValueError(
                     f"{role}.driver is {table.driver!r} but simulation.{role}.driver is {simulated.driver!r}; "
                     f"leave simulation.{role}.driver out"

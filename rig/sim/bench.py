@@ -17,37 +17,13 @@ import numpy as np
 from model.specimen import Specimen
 from rig.sim.faults import Upset
 from rig.sim.film import Solve, solve_membrane
-from rig.sim.instruments.cia404 import CiA404
-from rig.sim.instruments.gsv8 import GSV8
-from rig.sim.instruments.iseg import IsegEDCP
-from rig.sim.instruments.keyence import KeyenceLKG
-from rig.sim.instruments.shvps import Shvps
-from rig.sim.instruments.zaber import ZaberStage
 from rig.sim.operator import Operator
-from rig.sim.settings import (
-    LINK_FAULTS,
-    CiA404Truth,
-    DisplacementTruth,
-    Fault,
-    ForceTruth,
-    HVTruth,
-    LinkTruth,
-    ShvpsTruth,
-    SimulationSettings,
-    StageTruth,
-)
+from rig.sim.settings import SimulationSettings
+from rig.sim.truth import LINK_FAULTS, ROLES, Fault
+from rig.sim.twin import SimulatedInstrument, Unasked
+from rig.sim.twins import registered
 from rig.sim.wire import ByteWire, FrameWire
 from rig.sim.world import World
-
-ROLES = ("stage", "force", "displacement", "hv")
-
-OnLine = ZaberStage | GSV8 | KeyenceLKG | Shvps
-OnBus = IsegEDCP | CiA404
-Instrument = OnLine | OnBus
-
-
-Unasked = ZaberStage | KeyenceLKG | IsegEDCP | CiA404
-"""Those that can send what nobody asked for."""
 
 
 class _Timed(Protocol):
@@ -86,11 +62,10 @@ class SimulatedBench:
         if unknown:
             raise ValueError(f"no simulated instrument for {', '.join(sorted(unknown))}; there are {', '.join(ROLES)}")
         self.settings = settings
-        self.world = World(settings, specimen, "hv" in roles, solve)
+        self.world = World(settings, settings.stage, settings.hv if "hv" in roles else None, specimen, solve)
         self.operator = Operator(self.world, self._rng("operator"))
-        self.instruments: dict[str, Instrument] = {}
-        self._lines: dict[str, tuple[ByteWire, OnLine]] = {}
-        self._buses: dict[str, tuple[FrameWire, OnBus]] = {}
+        self.instruments: dict[str, SimulatedInstrument] = {}
+        self._wire: dict[str, ByteWire | FrameWire] = {}
         self._upsets: dict[tuple[str, str], Upset] = {}
         self.now = 0.0
         for role in ROLES:
@@ -99,7 +74,10 @@ class SimulatedBench:
         # The order of things that happen at one time: sensors see the world as it was, then it moves on.
         self._sensors: list[_Timed] = [self.instruments[r] for r in ("force", "displacement") if r in roles]
         self._actors: list[_Timed] = [self.world, *(self.instruments[r] for r in ("stage", "hv") if r in roles)]
-        self._wires: list[ByteWire | FrameWire] = [self.wire(role) for role in self.instruments]
+        # Serial lines deliver before buses: the order of things that arrive at one time is part of a run.
+        wires = [(wire, self.instruments[role]) for role, wire in self._wire.items()]
+        self._ends = sorted(wires, key=lambda end: isinstance(end[0], FrameWire))
+        self._wires = [wire for wire, _ in wires]
         self._due: list[tuple[float, int, bool, Fault]] = []
         self._injected = 0
         for fault in settings.fault:
@@ -110,32 +88,10 @@ class SimulatedBench:
         return np.random.default_rng([self.settings.seed & 0xFFFF_FFFF_FFFF_FFFF, zlib.crc32(name.encode())])
 
     def _build(self, role: str) -> None:
-        s, rng = self.settings, self._rng(role)
-        truth = {"stage": s.stage, "force": s.force, "displacement": s.displacement, "hv": s.hv}[role]
-        match truth:
-            case HVTruth() | CiA404Truth():
-                bus = FrameWire(truth.latency_ms * 1e-3, truth.bitrate)
-                node: OnBus
-                if isinstance(truth, HVTruth):
-                    node = IsegEDCP(truth, self.world, bus, rng)
-                else:
-                    node = CiA404(truth, self.world, bus, rng)
-                self._buses[role] = bus, node
-                self.instruments[role] = node
-                return
-        wire = _wire(truth.link)
-        instrument: OnLine
-        match truth:
-            case StageTruth():
-                instrument = ZaberStage(truth, self.world, wire)
-            case ForceTruth():
-                instrument = GSV8(truth, self.world, wire, rng)
-            case ShvpsTruth():
-                instrument = Shvps(truth, self.world, wire, rng)
-            case DisplacementTruth():
-                instrument = KeyenceLKG(truth, self.world, wire, rng)
-        self._lines[role] = wire, instrument
-        self.instruments[role] = instrument
+        truth = self.settings.truth(role)
+        wire = self._wire[role] = truth.wire()
+        twin = registered().twins[role, truth.driver]
+        self.instruments[role] = twin.make(truth, self.world, wire, self._rng(role))
 
     def prepare(self) -> None:
         """Do now what takes long (the film's table), so that nothing waits for it later."""
@@ -143,7 +99,7 @@ class SimulatedBench:
 
     def wire(self, role: str) -> ByteWire | FrameWire:
         """The wire to the instrument of ``role``; the host uses its ``host_write`` and ``host_read``."""
-        return self._buses[role][0] if role in self._buses else self._lines[role][0]
+        return self._wire[role]
 
     # Time
 
@@ -183,14 +139,10 @@ class SimulatedBench:
                 self._switch(fault, number, begins, step)
 
     def _deliver(self, t: float) -> None:
-        for wire, instrument in self._lines.values():
+        for wire, instrument in self._ends:
             if wire.next_delivery <= t:
                 for arrived, data in wire.deliveries(t):
                     instrument.receive(data, arrived)
-        for bus, node in self._buses.values():
-            if bus.next_delivery <= t:
-                for arrived, frame in bus.deliveries(t):
-                    node.receive(frame, arrived)
 
     # Faults
 
@@ -247,43 +199,22 @@ class SimulatedBench:
 
     def _switch_device(self, fault: Fault, number: int, begins: bool, t: float) -> None:
         instrument = self.instruments[fault.role]
-        if isinstance(instrument, Unasked) and fault.kind == "alert":
-            if fault.value == 0:
-                instrument.before_reply = self._interleave(instrument, fault, number) if begins else None
-            else:
-                self._alert(instrument, fault, begins, t)
-            return
-        if fault.kind == "reset":
-            if begins:
-                instrument.reset(t)
-            return
-        if fault.kind == "freeze":
-            instrument.freeze(t, begins)
-            return
-        match instrument:
-            case ZaberStage():
-                instrument.wrong_status = "FS" if begins else None
-            case GSV8() | CiA404() if fault.kind == "saturate":
-                instrument.saturated = _sign(fault) if begins else 0
-            case GSV8():
-                instrument.set_status((3 if fault.value is None else int(fault.value) & 3) if begins else 0)
-            case CiA404():
-                instrument.status_bits = (1 if fault.value is None else int(fault.value) & 7) if begins else 0
-            case KeyenceLKG():
-                match fault.kind:
-                    case "saturate":
-                        instrument.saturated = _sign(fault) if begins else 0
-                    case "no_value":
-                        instrument.no_value = begins
-                    case _:
-                        instrument.wrong_status = begins
-            case IsegEDCP() | Shvps():
-                self._switch_supply(instrument, fault, begins, t)
+        match fault.kind:
+            case "alert" if isinstance(instrument, Unasked):
+                if fault.value == 0:
+                    instrument.before_reply = self._interleave(instrument, fault, number) if begins else None
+                elif begins:
+                    self._alert(instrument, fault, t)
+            case "reset":
+                if begins:
+                    instrument.reset(t)
+            case "freeze":
+                instrument.freeze(t, begins)
+            case _:
+                instrument.switch(fault, begins, t)
 
-    def _alert(self, instrument: Unasked, fault: Fault, begins: bool, t: float) -> None:
+    def _alert(self, instrument: Unasked, fault: Fault, t: float) -> None:
         """Unsolicited lines: one, or one every ``value`` seconds for the duration of the fault."""
-        if not begins:
-            return
         instrument.alert(t)
         if fault.duration_s is not None:
             period = fault.value or 0.1
@@ -299,33 +230,3 @@ class SimulatedBench:
                 instrument.alert(t)
 
         return alert_by_chance
-
-    def _switch_supply(self, supply: IsegEDCP | Shvps, fault: Fault, begins: bool, t: float) -> None:
-        match fault.kind:
-            case "stuck_on":
-                supply.stuck_on = begins
-            case "breakdown":
-                self.world.broken_down = begins
-            case "over_current":
-                leak = supply.largest_current * 2 if fault.value is None else fault.value
-                self.world.extra_leakage = leak if begins else 0.0
-            case "sag":
-                supply.set_sag(t, (0.5 if fault.value is None else fault.value) if begins else 1.0)
-            case "interlock" if isinstance(supply, IsegEDCP):
-                supply.open_interlock(t, begins)
-            case "inhibit" if isinstance(supply, IsegEDCP):
-                supply.inhibit(t, begins)
-            case "wrong_status":
-                if isinstance(supply, Shvps):
-                    supply.wrong_mode = int(fault.value or 0) if begins else None
-                else:
-                    bits = 0xFFFF if fault.value is None else int(fault.value) & 0xFFFF
-                    supply.wrong_status = bits if begins else 0
-
-
-def _sign(fault: Fault) -> int:
-    return -1 if fault.value is not None and fault.value < 0 else 1
-
-
-def _wire(link: LinkTruth) -> ByteWire:
-    return ByteWire(link.latency_ms * 1e-3, link.baud)

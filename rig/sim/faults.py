@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rig.sim.settings import Fault
+from rig.sim.truth import Fault
 from rig.sim.wire import Frame
 
 DELAY_S = 0.5  # default of a delay

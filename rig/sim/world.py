@@ -16,16 +16,16 @@ from model.material.materials import Material
 from model.specimen import Specimen
 from rig.sim.film import FilmTable, Solve, solve_membrane, tabulate
 from rig.sim.path import Path
-from rig.sim.settings import SimulationSettings
+from rig.sim.truth import OutputTruth, RigTruth, StageTruth
 
 Floats = npt.NDArray[np.float64]
 
 TICK = 0.01  # s; the film's relaxation is integrated, and its strength checked, on this grid
 
 
-def true_specimen(settings: SimulationSettings, specimen: Specimen) -> Specimen:
+def true_specimen(rig: RigTruth, specimen: Specimen) -> Specimen:
     """The specimen with the film that is really mounted."""
-    film, guess = settings.film, specimen.material
+    film, guess = rig.film, specimen.material
     changes: dict[str, object] = {}
     if film.mu_Pa is not None and film.alpha is not None:
         changes |= {"mu": tuple(film.mu_Pa), "alpha": tuple(film.alpha)}
@@ -69,18 +69,22 @@ class World:
     """
 
     def __init__(
-        self, settings: SimulationSettings, specimen: Specimen, has_hv: bool, solve: Solve = solve_membrane
+        self,
+        rig: RigTruth,
+        stage: StageTruth,
+        output: OutputTruth | None,
+        specimen: Specimen,
+        solve: Solve = solve_membrane,
     ) -> None:
-        self.specimen = true_specimen(settings, specimen)
-        self._settings = settings
-        self._has_hv = has_hv
+        self.specimen = true_specimen(rig, specimen)
+        self._electrodes = output
         self._solve = solve
-        self._contact = settings.contact_position_mm * 1e-3
-        self.compliance = settings.rig_compliance_um_per_N * 1e-6
-        self._screw_error = settings.stage.screw_error_um * 1e-6
-        self._screw_wave = 2 * math.pi / (settings.stage.screw_pitch_mm * 1e-3)
-        self.stage = Path(settings.stage.start_position_mm * 1e-3)
-        self.output = Path(settings.hv.start_live_V if has_hv else 0.0)
+        self._contact = rig.contact_position_mm * 1e-3
+        self.compliance = rig.rig_compliance_um_per_N * 1e-6
+        self._screw_error = stage.screw_error_um * 1e-6
+        self._screw_wave = 2 * math.pi / (stage.screw_pitch_mm * 1e-3)
+        self.stage = Path(stage.start_position_mm * 1e-3)
+        self.output = Path(0.0 if output is None else output.start_live_V)
         self.torn = False
         self.broken_down = False
         self.extra_leakage = 0.0
@@ -88,7 +92,7 @@ class World:
         self.dummy_at = math.inf
         self.weight = 0.0
         self._table: FilmTable | None = None
-        self._branches = [(b.modulus_ratio, b.time_s) for b in settings.film.maxwell]
+        self._branches = [(b.modulus_ratio, b.time_s) for b in rig.film.maxwell]
         self._overstress = [0.0] * len(self._branches)
         self._elastic = 0.0  # F_e at the last tick
         self._tick = 0
@@ -99,7 +103,7 @@ class World:
     def film(self) -> FilmTable:
         """The film's table, made when it is first needed."""
         if self._table is None:
-            self._table = tabulate(self.specimen, self.compliance, self._has_hv, self._solve)
+            self._table = tabulate(self.specimen, self.compliance, self._electrodes is not None, self._solve)
         return self._table
 
     # At one time, for instruments
@@ -180,14 +184,18 @@ class World:
     @property
     def film_resistance(self) -> float:
         """Resistance between the electrodes (ohm)."""
-        hv = self._settings.hv
+        hv = self._electrodes
+        if hv is None:
+            return math.inf
         return hv.arc_resistance_kOhm * 1e3 if self.broken_down else hv.leakage_resistance_GOhm * 1e9
 
     def current(self, t: float) -> float:
         """Current out of the supply (A): charging, leakage, and what a fault adds."""
+        if self._electrodes is None:
+            return 0.0
         voltage, slope = self.output.at(t)
         extra = self.extra_leakage if voltage > 0 else 0.0
-        return self._settings.hv.film_capacitance_nF * 1e-9 * slope + voltage / self.film_resistance + extra
+        return self._electrodes.film_capacitance_nF * 1e-9 * slope + voltage / self.film_resistance + extra
 
     @property
     def next_time(self) -> float:

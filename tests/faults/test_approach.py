@@ -20,7 +20,7 @@ from rig.log.reader import read_log
 from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
 from rig.sim.instruments.zaber import ZaberStage
-from rig.sim.settings import Fault
+from rig.sim.truth import Fault
 
 Tell = Callable[..., Any]  # of conftest.Story
 SPEED = 0.8e-3  # m/s

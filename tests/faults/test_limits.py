@@ -26,7 +26,7 @@ from rig.run.backend import open_bench
 from rig.safety.limits import Limits
 from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import Fault
+from rig.sim.truth import Fault
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 Tell = Callable[..., Any]  # of conftest.Story

@@ -21,7 +21,9 @@ from model.specimen import Specimen
 from rig.base.clock import VirtualClock
 from rig.bench.memory_link import MemoryByteLink, MemoryFrameLink
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import Fault, ForceTruth, SimulationSettings
+from rig.sim.instruments.gsv8 import GSV8Truth
+from rig.sim.settings import SimulationSettings
+from rig.sim.truth import Fault
 from rig.sim.wire import ByteWire, FrameWire
 
 SPECIMEN = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
@@ -34,7 +36,7 @@ class Rig:
 
     def __init__(self, *, on: bool) -> None:
         settings = SimulationSettings(
-            seed=1, force=ForceTruth(noise_fraction=0.0, zero_offset_mV_per_V=TRUE_READING, stored_rate_Hz=100.0)
+            seed=1, force=GSV8Truth(noise_fraction=0.0, zero_offset_mV_per_V=TRUE_READING, stored_rate_Hz=100.0)
         )
         self.bench = SimulatedBench(settings, SPECIMEN, {"force", "hv"})
         self.clock = VirtualClock(self.bench.advance)

@@ -41,13 +41,15 @@ from model.specimen import Specimen
 from rig.base.clock import VirtualClock
 from rig.bench.memory_link import MemoryByteLink, MemoryFrameLink
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import TWINS, Fault, SimulationSettings
+from rig.sim.settings import SimulationSettings
+from rig.sim.truth import Fault
+from rig.sim.twins import registered
 from rig.sim.wire import FrameWire
 
 FILM = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
 VOLTS = 1000.0
 FAULT_S, AFTER_S = 3.0, 4.0
-ROLE_OF = {driver: role for role, twins in TWINS.items() for driver in twins}
+ROLE_OF = {one.driver: one.role for one in registered().twins.values()}
 DRIVERS: dict[str, Callable[..., Any]] = {
     "zaber": ZaberStage,
     "gsv8": GSV8,
@@ -269,7 +271,7 @@ class Watched:
         return min(near) - slack <= value_of(sample) <= max(near) + slack
 
 
-CASES = [(driver, kind) for twins in TWINS.values() for driver, twin in twins.items() for kind in twin.faults()]
+CASES = [(one.driver, kind) for one in registered().twins.values() for kind in one.truth.faults()]
 
 
 @pytest.mark.parametrize(("driver", "kind"), CASES)

@@ -21,7 +21,7 @@ from rig.safety.heartbeat import Heartbeat
 from rig.safety.process import TRY_S, Server, Voice
 from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import Fault
+from rig.sim.truth import Fault
 
 Tell = Callable[..., Any]  # of conftest.Story
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"

@@ -11,7 +11,7 @@ import pytest
 from rig.base.errors import FaultError
 from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import Fault
+from rig.sim.truth import Fault
 
 Tell = Callable[..., Any]  # of conftest.Story
 AT_ONCE_S = 1.5

@@ -18,7 +18,7 @@ from rig.log.reader import read_log
 from rig.safety.guard import AT_ONCE_S
 from rig.safety.remote import LEAVE_S
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import Fault
+from rig.sim.truth import Fault
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
 

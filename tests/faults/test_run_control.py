@@ -169,7 +169,7 @@ def test_prompts_are_asked_with_the_voltage_off_and_arming_begins_anew(tell: Tel
 
 def test_the_loop_goes_on_while_the_operator_is_waited_for(tell: Tell) -> None:
     """A load cell lost while a question is open ends the run, though nobody has answered."""
-    from rig.sim.settings import Fault
+    from rig.sim.truth import Fault
 
     def meanwhile(now: float, bench: SimulatedBench, control: Control) -> None:
         if control.question is not None and "Look" in control.question.text and not lost:

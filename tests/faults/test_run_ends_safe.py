@@ -18,7 +18,7 @@ from rig.log.reader import read_log
 from rig.log.writer import LogWriter
 from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import Fault
+from rig.sim.truth import Fault
 
 Tell = Callable[..., Any]  # of conftest.Story
 RAMP_DOWN_S = 1000 / 300 + 1.0  # from 1000 V at the scene's 300 V/s, and a second for polling

@@ -18,7 +18,9 @@ from model.specimen import Specimen
 from rig.base.clock import VirtualClock
 from rig.bench.memory_link import MemoryByteLink
 from rig.sim.bench import SimulatedBench
-from rig.sim.settings import Fault, SimulationSettings, StageTruth
+from rig.sim.instruments.zaber import ZaberTruth
+from rig.sim.settings import SimulationSettings
+from rig.sim.truth import Fault
 from rig.sim.wire import ByteWire
 
 SPECIMEN = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
@@ -33,7 +35,7 @@ class Rig:
             seed=1,
             contact_position_mm=CONTACT * 1e3,
             rig_compliance_um_per_N=0.0,
-            stage=StageTruth(start_position_mm=0.0, referenced_at_start=True),
+            stage=ZaberTruth(start_position_mm=0.0, referenced_at_start=True),
         )
         self.bench = SimulatedBench(settings, SPECIMEN, {"stage", "displacement"})
         self.clock = VirtualClock(self.bench.advance)

@@ -39,7 +39,7 @@ from rig.safety.limits import FilmLimits, Limits
 from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.film import FilmTable
-from rig.sim.settings import Fault
+from rig.sim.truth import Fault
 from rig.sim.wire import FrameWire
 
 SCENE, _ = load_scene(Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml")

@@ -16,14 +16,15 @@ import pytest
 
 from model.membrane.solve import solve_many
 from rig.log.reader import read_log
-from rig.sim.settings import TWINS, Fault
+from rig.sim.truth import Fault
+from rig.sim.twins import registered
 
 pytestmark = pytest.mark.slow
 
 Tell = Callable[..., Any]  # of conftest.Story
 RAMP_DOWN_S = 1000 / 300 + 1.0  # from 1000 V at the scene's 300 V/s, and a second for polling
 AT_ONCE_S = 1.5
-ROLE_OF = {driver: role for role, twins in TWINS.items() for driver in twins}
+ROLE_OF = {one.driver: one.role for one in registered().twins.values()}
 SCENE_OF = {"cia404": "other-instruments", "shvps": "other-instruments"}  # the others are in cone-4mm
 
 # What is tolerated: a little of everything that happens on a long wire, one after the other in one run; and counters of
@@ -188,6 +189,6 @@ def test_the_run_ends_as_required(tell: Tell, driver: str, kind: str) -> None:
 
 
 def test_every_switch_of_every_instrument_has_its_required_behaviour() -> None:
-    switches = {(driver, kind) for twins in TWINS.values() for driver, twin in twins.items() for kind in twin.faults()}
+    switches = {(one.driver, kind) for one in registered().twins.values() for kind in one.truth.faults()}
     tolerated = {(driver, kind) for driver, kinds in LITTLE.items() for kind in kinds}
     assert switches == tolerated | set(ENDS)

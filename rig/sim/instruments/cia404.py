@@ -17,11 +17,14 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Literal, Self
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from rig.sim.noise import ConversionNoise
-from rig.sim.settings import CiA404Truth
+from rig.sim.truth import BusTruth, Fault, Fraction, LoadCellTruth, Positive
+from rig.sim.twin import Twin
 from rig.sim.wire import Frame, FrameWire
 from rig.sim.world import World
 
@@ -86,6 +89,32 @@ class _Entry:
         return struct.pack(f"<{self.kind}", value)
 
 
+class CiA404Truth(LoadCellTruth, BusTruth):
+    """Load cell on CANopen, device profile CiA 404; it states newtons or millinewtons itself."""
+
+    driver: Literal["cia404"] = Field(default="cia404", description="CiA 404 load cell.")
+    serial_number: int = Field(default=77_120, description="Serial number that it states.")
+    node: int = Field(default=5, ge=1, le=127, description="Its node number.")
+    inputs: int = Field(default=1, ge=1, le=4, description="How many analogue inputs it has; all but one are open.")
+    channel: int = Field(default=1, ge=1, le=4, description="The input with the load cell.")
+    unit: Literal["N", "mN"] = Field(default="N", description="Unit of its process values.")
+    decimals: int = Field(default=4, ge=0, le=6, description="Decimal digits of its integer process values.")
+    zero_offset_N: float = Field(default=0.004, description="What the unloaded cell shows (N).")
+    overload_factor: Positive = Field(default=1.2, description="End of the measuring range, in full scales.")
+    tare_fraction: Fraction = Field(default=0.2, description="Largest value that autozero takes, of full scale.")
+    conversion_rate_Hz: Positive = Field(default=1000.0, description="How often it measures (Hz).")
+    stored_event_time_ms: int = Field(
+        default=100, ge=0, le=65_535, description="Period of its process data at power-up (ms), object 1800h:5."
+    )
+    heartbeat_ms: int = Field(default=0, ge=0, le=65_535, description="Period of its heartbeat (ms); 0: none.")
+
+    @model_validator(mode="after")
+    def _channel_exists(self) -> Self:
+        if self.channel > self.inputs:
+            raise ValueError(f"channel is {self.channel}, but there are only {self.inputs} inputs")
+        return self
+
+
 class CiA404:
     """One node, one of its analogue inputs with the load cell, the others open (0 N).
 
@@ -133,6 +162,13 @@ class CiA404:
         self._frozen = None
         if frozen:
             self._frozen = self._newtons(self._settings.channel, t)
+
+    def switch(self, fault: Fault, begins: bool, t: float) -> None:
+        """Its other faults: ``saturate``, and ``wrong_status``, bits that are set in the status."""
+        if fault.kind == "saturate":
+            self.saturated = fault.sign if begins else 0
+        else:
+            self.status_bits = (1 if fault.value is None else int(fault.value) & 7) if begins else 0
 
     def alert(self, t: float) -> None:
         """An error appears (CAN overrun) and is gone again: two emergency messages."""
@@ -421,3 +457,6 @@ class CiA404:
         piece, rest = rest[:7], rest[7:]
         self._segments = (rest, 1 - toggle) if rest else None
         return bytes([toggle << 4 | (7 - len(piece)) << 1 | (not rest)]) + piece
+
+
+TWINS = (Twin(driver="cia404", role="force", truth=CiA404Truth, make=CiA404),)

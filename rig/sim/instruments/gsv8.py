@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Final
+from collections.abc import Mapping
+from typing import ClassVar, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
-from rig.sim.settings import ForceTruth
+from rig.sim.truth import Fault, LineTruth, LinkTruth, LoadCellTruth, Positive
+from rig.sim.twin import Twin
 from rig.sim.wire import ByteWire
 from rig.sim.world import World
 
@@ -46,6 +49,22 @@ BRIDGE_8V75, BRIDGE_5V, BRIDGE_2V5 = 0, 1, 2
 UNIT_MV_PER_V = 0
 
 
+class GSV8Truth(LoadCellTruth, LineTruth):
+    """Strain-gauge cell on an ME-Messsysteme GSV-8."""
+
+    means_nothing: ClassVar[Mapping[str, str]] = {"alert": "it streams: nothing that it sends was asked for"}
+
+    driver: Literal["gsv8"] = Field(default="gsv8", description="GSV-8 amplifier with a load cell.")
+    serial_number: int = Field(default=14_209_876, description="Serial number that it states.")
+    channel: int = Field(default=1, ge=1, le=8, description="The input with the load cell; the others are open.")
+    sensitivity_mV_per_V: Positive = Field(default=2.0, description="Nominal output at full scale (mV/V).")
+    zero_offset_mV_per_V: float = Field(default=0.013, description="Output of the unloaded cell (mV/V).")
+    input_range_mV_per_V: Positive = Field(default=3.5, description="Input range at 5 V bridge supply (mV/V).")
+    raw_range_factor: Positive = Field(default=1.05, description="Signal at the largest raw number, in input ranges.")
+    stored_rate_Hz: Positive = Field(default=100.0, description="Rate at which it streams after power-up (Hz).")
+    link: LinkTruth = Field(default=LinkTruth(latency_ms=1.0, baud=0), description="Its USB serial line.")
+
+
 class GSV8:
     """Eight channels, one of them with the load cell, the others open.
 
@@ -55,7 +74,7 @@ class GSV8:
         A fault: sign of the rail the input is stuck at, 0 for none.
     """
 
-    def __init__(self, settings: ForceTruth, world: World, wire: ByteWire, rng: np.random.Generator) -> None:
+    def __init__(self, settings: GSV8Truth, world: World, wire: ByteWire, rng: np.random.Generator) -> None:
         self._settings = settings
         self._world = world
         self._wire = wire
@@ -97,9 +116,12 @@ class GSV8:
         """A fault: from now on every sample has the value of time ``t``."""
         self._frozen = self._bridge(t) if frozen else None
 
-    def set_status(self, bits: int) -> None:
-        """A fault: these bits of the status byte are set in every frame from now on."""
-        self._status = bits
+    def switch(self, fault: Fault, begins: bool, t: float) -> None:
+        """Its other faults: ``saturate``, and ``wrong_status``, bits of the status byte that are set in every frame."""
+        if fault.kind == "saturate":
+            self.saturated = fault.sign if begins else 0
+        else:
+            self._status = (3 if fault.value is None else int(fault.value) & 3) if begins else 0
 
     # What it measures
 
@@ -319,3 +341,6 @@ class GSV8:
                 for channel in channels:
                     self._input_type[channel] = p[1]
         return OK, b""
+
+
+TWINS = (Twin(driver="gsv8", role="force", truth=GSV8Truth, make=GSV8),)

@@ -10,13 +10,17 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from rig.sim.noise import ConversionNoise
-from rig.sim.settings import HVTruth
+from rig.sim.supply import switch_output
+from rig.sim.truth import IN_REACH, ONE_PIECE, BusTruth, Fault, NotNegative, OutputTruth, Positive
+from rig.sim.twin import Twin
 from rig.sim.wire import Frame, FrameWire
 from rig.sim.world import TICK, World
 
@@ -63,6 +67,28 @@ class _Channel:
     limiting: bool = False
 
 
+class IsegTruth(OutputTruth, BusTruth):
+    """iseg EDCP module on CAN; the film is on its first channel."""
+
+    means_nothing: ClassVar[Mapping[str, str]] = ONE_PIECE | IN_REACH
+    more_faults: ClassVar[tuple[str, ...]] = (*OutputTruth.more_faults, "interlock", "inhibit")
+
+    driver: Literal["iseg-edcp"] = Field(default="iseg-edcp", description="iseg supply on CAN.")
+    serial_number: int = Field(default=484_216, description="Serial number that it states.")
+    module: int = Field(default=0, ge=0, le=63, description="Its module number.")
+    channels: int = Field(default=1, ge=1, le=16, description="How many channels it has.")
+    bitrate: Literal[125_000, 250_000] = Field(default=125_000, description="Of the bus (bit/s).")
+    nominal_voltage_V: Positive = Field(default=6000.0, description="Nominal voltage of a channel (V).")
+    nominal_current_mA: Positive = Field(default=1.0, description="Nominal current of a channel (mA).")
+    ramp_percent_per_s: Positive = Field(default=10.0, description="Voltage ramp at power-up (% of nominal per s).")
+    max_ramp_percent_per_s: Positive = Field(default=20.0, description="Fastest voltage ramp (% of nominal per s).")
+    voltage_noise_V: NotNegative = Field(default=0.3, description="Standard deviation of a voltage reading (V).")
+    current_noise_nA: NotNegative = Field(default=5.0, description="Standard deviation of a current reading (nA).")
+    voltage_limit_percent: Positive = Field(default=100.0, description="Hardware voltage limit (% of nominal).")
+    current_limit_percent: Positive = Field(default=100.0, description="Hardware current limit (% of nominal).")
+    logon_period_s: Positive = Field(default=5.0, description="How often it announces itself, not registered (s).")
+
+
 class IsegEDCP:
     """One module.
 
@@ -75,7 +101,7 @@ class IsegEDCP:
         A fault: called with the time before each answer is sent.
     """
 
-    def __init__(self, settings: HVTruth, world: World, wire: FrameWire, rng: np.random.Generator) -> None:
+    def __init__(self, settings: IsegTruth, world: World, wire: FrameWire, rng: np.random.Generator) -> None:
         self._settings = settings
         self._world = world
         self._wire = wire
@@ -142,6 +168,19 @@ class IsegEDCP:
         if self.before_reply is not None:
             self.before_reply(t)
         self._wire.send((self._base, data), t + ANSWER_S)
+
+    def switch(self, fault: Fault, begins: bool, t: float) -> None:
+        """Its other faults: those of every output, ``interlock``, ``inhibit`` and ``wrong_status``."""
+        match fault.kind:
+            case "interlock":
+                self.open_interlock(t, begins)
+            case "inhibit":
+                self.inhibit(t, begins)
+            case "wrong_status":
+                bits = 0xFFFF if fault.value is None else int(fault.value) & 0xFFFF
+                self.wrong_status = bits if begins else 0
+            case _:
+                switch_output(self, self._world, fault, begins, t)
 
     def open_interlock(self, t: float, is_open: bool) -> None:
         """The safety loop opens (output off at once) or closes."""
@@ -577,3 +616,6 @@ class IsegEDCP:
                 self._drive(channel, t)
         elif channel.on:
             self._off_with_ramp(channel, t)
+
+
+TWINS = (Twin(driver="iseg-edcp", role="hv", truth=IsegTruth, make=IsegEDCP),)

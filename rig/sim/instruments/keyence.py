@@ -11,11 +11,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from rig.sim.noise import ConversionNoise
-from rig.sim.settings import DisplacementTruth
+from rig.sim.truth import Fault, LineTruth, NotNegative, Positive
+from rig.sim.twin import Twin
 from rig.sim.wire import ByteWire
 from rig.sim.world import World
 
@@ -42,6 +45,29 @@ class _Refused(Exception):
         self.number = number
 
 
+class KeyenceTruth(LineTruth):
+    """Keyence LK-G152 laser triangulation head."""
+
+    more_faults: ClassVar[tuple[str, ...]] = ("no_value",)
+
+    driver: Literal["keyence-lkg"] = Field(default="keyence-lkg", description="Keyence LK-G laser.")
+    range_mm: Positive = Field(default=40.0, description="How far it sees to either side of its middle (mm).")
+    offset_mm: float = Field(default=1.25, description="What it shows for the flat film (mm).")
+    gain_error: float = Field(default=0.0, description="Hidden relative error of the scale. Typical: +-0.001.")
+    noise_um: NotNegative = Field(
+        default=0.5, description="Standard deviation of a reading as averaged at power-up (um)."
+    )
+    resolution_um: Positive = Field(default=0.1, description="Step of its readings (um).")
+    averaging_code: int = Field(default=4, ge=0, le=9, description="Averages 4^code samples, as in SW,OC.")
+    sampling_code: int = Field(
+        default=1, ge=0, le=5, description="Sampling period: 20, 50, 100, 200, 500, 1000 us, as in SW,CA."
+    )
+    answer_ms: NotNegative = Field(default=1.0, description="How long it takes to answer (ms).")
+    lag_ms: NotNegative = Field(
+        default=0.0, description="By how much a reading is older than its averaging time tells (ms)."
+    )
+
+
 class KeyenceLKG:
     """One head on OUT1; OUT2 shows the same head without averaging.
 
@@ -53,7 +79,7 @@ class KeyenceLKG:
         A fault: called with the time before each reply is sent.
     """
 
-    def __init__(self, settings: DisplacementTruth, world: World, wire: ByteWire, rng: np.random.Generator) -> None:
+    def __init__(self, settings: KeyenceTruth, world: World, wire: ByteWire, rng: np.random.Generator) -> None:
         self._settings = settings
         self._world = world
         self._wire = wire
@@ -100,6 +126,16 @@ class KeyenceLKG:
         self._frozen = None
         if frozen:
             self._frozen = self._millimetres(1, t)
+
+    def switch(self, fault: Fault, begins: bool, t: float) -> None:
+        """Its other faults: ``saturate``, ``no_value`` and ``wrong_status``, as its attributes say."""
+        match fault.kind:
+            case "saturate":
+                self.saturated = fault.sign if begins else 0
+            case "no_value":
+                self.no_value = begins
+            case _:
+                self.wrong_status = begins
 
     # What it measures
 
@@ -309,3 +345,6 @@ MEASURE_MODE = {
     **dict.fromkeys(["PR", "AQ", "AS", "AP", "AN"], 0),
     **dict.fromkeys(["VR", "PW", "KL", "AO"], 1),
 }
+
+
+TWINS = (Twin(driver="keyence-lkg", role="displacement", truth=KeyenceTruth, make=KeyenceLKG),)

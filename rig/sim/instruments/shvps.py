@@ -14,12 +14,16 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Final
+from collections.abc import Mapping
+from typing import ClassVar, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from rig.sim.noise import ConversionNoise
-from rig.sim.settings import ShvpsTruth
+from rig.sim.supply import switch_output
+from rig.sim.truth import IN_REACH, Fault, LineTruth, NotNegative, OutputTruth, Positive
+from rig.sim.twin import Twin
 from rig.sim.wire import ByteWire
 from rig.sim.world import TICK, World
 
@@ -39,6 +43,23 @@ NUMBERS: dict[str, tuple[int, int, int]] = {
     "I2C": (12, 8, 119),
 }
 LOWEST_HZ, HIGHEST_HZ = 1e-3, 5e3
+
+
+class ShvpsTruth(OutputTruth, LineTruth):
+    """shvps, the peta-pico-Voltron single-channel supply of dielectric-elastomer labs, on a serial port."""
+
+    means_nothing: ClassVar[Mapping[str, str]] = IN_REACH | {"alert": "it never speaks unasked"}
+
+    driver: Literal["shvps"] = Field(default="shvps", description="shvps supply.")
+    board: str = Field(default="HVPS 7", pattern=r"^[ -~]{1,32}$", description="Name that was given to the board.")
+    maximum_voltage_V: int = Field(default=5000, ge=1, le=10_000, description="Largest voltage of the board (V).")
+    slew_V_per_s: Positive = Field(default=20_000.0, description="How fast the regulated output rises (V/s).")
+    largest_current_uA: Positive = Field(default=200.0, description="What the converter can give at most (uA).")
+    voltage_noise_V: NotNegative = Field(default=0.7, description="Standard deviation of a voltage reading (V).")
+    reading_period_s: Positive = Field(default=0.01, description="Period of the board's voltage measurement (s).")
+    answer_ms: NotNegative = Field(default=1.0, description="How long it takes to answer (ms).")
+    reboot_s: Positive = Field(default=2.0, description="How long it is silent after power comes back (s).")
+    power_jack: bool = Field(default=True, description="Whether the power jack is plugged in.")
 
 
 class Shvps:
@@ -89,6 +110,13 @@ class Shvps:
         self._frozen = None
         if frozen:
             self._frozen = self._reading(t)
+
+    def switch(self, fault: Fault, begins: bool, t: float) -> None:
+        """Its other faults: those of every output, and ``wrong_status``: another mode."""
+        if fault.kind == "wrong_status":
+            self.wrong_mode = int(fault.value or 0) if begins else None
+        else:
+            switch_output(self, self._world, fault, begins, t)
 
     def set_sag(self, t: float, left: float) -> None:
         """A fault: only this part of the set-point reaches the output from now on."""
@@ -226,3 +254,6 @@ class Shvps:
             return False
         self._drive(t)
         return True
+
+
+TWINS = (Twin(driver="shvps", role="hv", truth=ShvpsTruth, make=Shvps),)

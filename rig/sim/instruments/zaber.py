@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Mapping
+from typing import ClassVar, Literal
+
+from pydantic import Field
 
 from rig.sim.path import trapezoid
-from rig.sim.settings import StageTruth
+from rig.sim.truth import Fault, LineTruth, Positive, StageTruth
+from rig.sim.twin import Twin
 from rig.sim.wire import ByteWire
 from rig.sim.world import World
 
@@ -37,6 +40,25 @@ def checksum(body: bytes) -> bytes:
     return b"%02X" % (-sum(body) & 0xFF)
 
 
+class ZaberTruth(StageTruth, LineTruth):
+    """Zaber X-LSQ150B-E01 on ASCII."""
+
+    means_nothing: ClassVar[Mapping[str, str]] = {"saturate": "a position ends at the travel's limits"}
+
+    driver: Literal["zaber"] = Field(default="zaber", description="Zaber stage.")
+    serial_number: int = Field(default=50_443, description="Serial number that it states.")
+    device_address: int = Field(default=1, ge=1, le=99, description="Its address on the line.")
+    microstep_um: Positive = Field(default=0.49609375, description="Travel per microstep (um).")
+    travel_mm: Positive = Field(default=151.498, description="Its travel (mm).")
+    referenced_at_start: bool = Field(default=False, description="Whether it is homed at power-up.")
+    default_speed_mm_per_s: Positive = Field(default=20.0, description="Its speed setting at power-up (mm/s).")
+    max_speed_mm_per_s: Positive = Field(default=100.0, description="Largest speed that it can be set to (mm/s).")
+    acceleration_mm_per_s2: Positive = Field(default=200.0, description="Its acceleration setting (mm/s^2).")
+    homing_speed_mm_per_s: Positive = Field(default=10.0, description="Speed at which it homes (mm/s).")
+    reboot_s: Positive = Field(default=0.5, description="How long it is silent after power comes back (s).")
+    unhomed_reject: str = Field(default="BADDATA", description="Reject word for a move before homing.")
+
+
 class ZaberStage:
     """One device with one axis.
 
@@ -48,7 +70,7 @@ class ZaberStage:
         A fault: called with the time before each reply is sent.
     """
 
-    def __init__(self, settings: StageTruth, world: World, wire: ByteWire) -> None:
+    def __init__(self, settings: ZaberTruth, world: World, wire: ByteWire) -> None:
         self._settings = settings
         self._world = world
         self._wire = wire
@@ -135,6 +157,10 @@ class ZaberStage:
     def alert(self, t: float) -> None:
         """Send an unsolicited alert with the present state."""
         self._send("!", f"{self._status(t)}", t, axis=1, word="", with_check=bool(self._values["comm.checksum"]))
+
+    def switch(self, fault: Fault, begins: bool, t: float) -> None:
+        """Its other fault is ``wrong_status``: the flag for a stall."""
+        self.wrong_status = "FS" if begins else None
 
     def reset(self, t: float) -> None:
         """Lose power and come back: motion stops dead, the reference is gone, deaf for a while; settings stay."""
@@ -376,3 +402,13 @@ class ZaberStage:
             return "RJ", "BADDATA"
         self._values[name] = value
         return "OK", "0"
+
+
+TWINS = (
+    Twin(
+        driver="zaber",
+        role="stage",
+        truth=ZaberTruth,
+        make=lambda truth, world, wire, rng: ZaberStage(truth, world, wire),  # nothing random about it
+    ),
+)

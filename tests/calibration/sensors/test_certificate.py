@@ -105,12 +105,14 @@ def test_files_that_are_not_certificates(tmp_path: Path) -> None:
 
 
 def test_the_examples_are_for_the_instruments_that_the_simulation_has() -> None:
-    from rig.sim.settings import CiA404Truth, ForceTruth, HVTruth
+    from rig.sim.instruments.cia404 import CiA404Truth
+    from rig.sim.instruments.gsv8 import GSV8Truth
+    from rig.sim.instruments.iseg import IsegTruth
 
     for name, serial in (
-        ("force", ForceTruth().serial_number),
+        ("force", GSV8Truth().serial_number),
         ("force-can", CiA404Truth(driver="cia404").serial_number),
-        ("hv", HVTruth().serial_number),
+        ("hv", IsegTruth().serial_number),
     ):
         assert load_certificate(EXAMPLES / f"{name}.toml").check(str(serial), date(2020, 1, 1)) == []
 

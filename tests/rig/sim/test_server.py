@@ -13,8 +13,8 @@ import serial
 
 from rig.base.clock import RealClock
 from rig.sim.server import Server
-from rig.sim.settings import Fault
 from rig.sim.slcan import SlcanAdapter
+from rig.sim.truth import Fault
 from rig.sim.wire import FrameWire
 
 # The adapter

@@ -19,7 +19,8 @@ CONTACT = 40e-3
 
 def world(has_hv: bool = True, **settings) -> World:
     table = {"seed": 1, "stage": {"screw_error_um": 0.0}} | settings
-    return World(SimulationSettings.model_validate(table), specimen(), has_hv, closed_form)
+    truth = SimulationSettings.model_validate(table)
+    return World(truth, truth.stage, truth.hv if has_hv else None, specimen(), closed_form)
 
 
 def at(quantity, t: float) -> float:
@@ -59,7 +60,8 @@ def test_film_is_not_asked_for_until_it_matters():
     def never(*_):
         raise AssertionError("solved a film that nobody touched")
 
-    w = World(SimulationSettings(seed=1), specimen(), True, never)
+    truth = SimulationSettings(seed=1)
+    w = World(truth, truth.stage, truth.hv, specimen(), never)
     w.advance(10.0)
     assert at(w.force, 10.0) == 0
 

@@ -7,7 +7,8 @@ import struct
 import pytest
 from pydantic import ValidationError
 
-from rig.sim.settings import Fault, SimulationSettings
+from rig.sim.settings import SimulationSettings
+from rig.sim.truth import Fault
 
 QUIET = {"driver": "cia404", "noise_fraction": 0.0, "zero_offset_N": 0.01}
 

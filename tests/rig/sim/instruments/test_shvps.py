@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from rig.sim.settings import Fault, SimulationSettings
+from rig.sim.settings import SimulationSettings
+from rig.sim.truth import Fault
 
 QUIET = {"driver": "shvps", "voltage_noise_V": 0.0}
 
