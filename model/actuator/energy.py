@@ -15,6 +15,7 @@ import numpy as np
 from model.actuator.equilibrium import Actuator
 from model.actuator.stroke import balancing, clenshaw_curtis, quadrature
 from model.arrays import Array
+from model.material.law import stack
 from model.membrane.solve import Wrinkling, solve
 from model.specimen import Specimen
 
@@ -51,10 +52,8 @@ def stored(film: Specimen, h: float, voltage: float, wrinkling: Wrinkling, toler
     p = solve(film, h, voltage, tolerance=tolerance, wrinkling=wrinkling).profile(PROFILE)
     material = film.material
     l1, l2 = p.stretch_1, p.stretch_2
-    density = sum(
-        mu / alpha * (l1**alpha + l2**alpha + (l1 * l2) ** -alpha - 3.0)
-        for mu, alpha in zip(material.mu, material.alpha, strict=True)
-    )
+    law = material.law(np.array(material.mu)[:, None], np.array(material.alpha)[:, None])
+    density = law.energy(stack(np.log(l1), np.log(l2)))
     ring = 2.0 * np.pi * p.R**2 / film.prestretch**2  # dR = R dx
     weights = _weights(np.log(p.R))
     elastic = float((ring * film.thickness * density) @ weights)

@@ -46,18 +46,10 @@ def read(point: Point, name: str) -> float:
     material = point.film.material
     if name == "eps_r":
         return material.eps_r
-    kind, number = _term(name)
-    if not 1 <= number <= len(material.mu):
-        raise ValueError(f"{name}: the material has {len(material.mu)} Ogden terms")
-    return float(getattr(material, kind)[number - 1])
-
-
-def _term(name: str) -> tuple[str, int]:
-    for kind in ("mu", "alpha"):
-        if name.startswith(kind) and name[len(kind) :].isdigit():
-            return kind, int(name[len(kind) :])
-    known = ", ".join((*FILM, *BIAS, "eps_r", "mu1", "alpha1"))
-    raise ValueError(f"{name!r} is no quantity of an actuator; known are {known}, ...")
+    if name not in material.values:
+        known = ", ".join((*FILM, *BIAS, "radius_ratio", "eps_r", *material.values))
+        raise ValueError(f"{name!r} is no quantity of the actuator; known are {known}")
+    return material.values[name]
 
 
 def changed(point: Point, values: dict[str, float]) -> Point:
@@ -72,14 +64,8 @@ def changed(point: Point, values: dict[str, float]) -> Point:
             film = replace(film, **attribute)
         elif name in BIAS:
             recipe = replace(recipe, **{name: value})  # type: ignore[type-var]
-        elif name == "eps_r":
-            film = film.with_material(replace(film.material, eps_r=value))
         else:
-            kind, number = _term(name)
-            terms = list(getattr(film.material, kind))
-            terms[number - 1] = value
-            attribute = {kind: tuple(terms)}
-            film = film.with_material(replace(film.material, **attribute))
+            film = film.with_material(film.material.with_value(name, value))
         point = replace(point, film=film, recipe=recipe)
     return point
 
@@ -93,8 +79,9 @@ def _of_film(film: Specimen, found: Solutions, name: str) -> Array:
         return np.zeros(found.shape)
     if name in FILM or name == "eps_r":
         return found.dforce[name]
-    kind, number = _term(name)
-    return np.asarray(found.dforce[kind][..., number - 1])
+    at = list(film.material.values).index(name)
+    moduli = len(film.material.mu)
+    return np.asarray(found.dforce["mu"][..., at] if at < moduli else found.dforce["alpha"][..., at - moduli])
 
 
 def _of_bias(point: Point, h: Array, name: str) -> Array:

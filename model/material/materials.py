@@ -1,10 +1,15 @@
-"""Elastomer films: Ogden terms, permittivity, strength; named sets with their source."""
+"""Elastomer films: a law with its parameters, permittivity, strength; named sets with their source."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
+
+from model.material.law import Law
+from model.material.ogden import Ogden
 
 # scipy.constants.epsilon_0 (CODATA 2022), written out because importing SciPy is slow; a test compares the two.
 EPSILON_0 = 8.8541878188e-12
@@ -12,21 +17,23 @@ EPSILON_0 = 8.8541878188e-12
 
 @dataclass(frozen=True)
 class Material:
-    r"""An incompressible Ogden dielectric in the convention of Cao & Conn 2018.
+    r"""An incompressible dielectric elastomer.
 
-    .. math:: W = \sum_n \frac{\mu_n}{\alpha_n} (l_1^{\alpha_n} + l_2^{\alpha_n} + (l_1 l_2)^{-\alpha_n} - 3)
-
-    so that the small-strain shear modulus is ``G = 1/2 sum mu_n alpha_n``. Other codes write ``2 mu / alpha^2`` in
-    front: there ``mu_other = mu * alpha / 2``.
+    By default its law is Ogden's, in the convention of Cao & Conn 2018 (`model.material.ogden`), whose small-strain
+    shear modulus is ``G = 1/2 sum mu_n alpha_n``.
 
     Parameters
     ----------
     name : what to call it in reports
-    mu, alpha : Ogden moduli (Pa) and exponents, one of each a term; single terms may be negative, G may not
+    mu : moduli of the law (Pa), in its order: Ogden's mu of every term, Gent's mu, Yeoh's C1, C2, C3
+    alpha : shape parameters of the law (dimensionless), in its order: Ogden's exponents, Gent's Jm
     eps_r : relative permittivity
     breakdown_field : dielectric strength (V/m, true field), or None when unknown
     max_stretch : largest stretch the film stands, or None when unknown
     source : where the numbers come from
+    law : what ``mu`` and ``alpha`` are parameters of
+
+    See `with_law` for the law's own names, and ``values`` for the way back.
     """
 
     name: str
@@ -36,24 +43,16 @@ class Material:
     breakdown_field: float | None = None
     max_stretch: float | None = None
     source: str = field(default="", compare=False)
+    law: type[Law] = Ogden
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mu", tuple(float(m) for m in self.mu))
         object.__setattr__(self, "alpha", tuple(float(a) for a in self.alpha))
         label = f"material {self.name!r}"
-        if not self.mu or len(self.mu) != len(self.alpha):
-            raise ValueError(
-                f"{label}: mu has {len(self.mu)} and alpha {len(self.alpha)} entries; give one of each per Ogden term"
-            )
-        for name, values in (("mu", self.mu), ("alpha", self.alpha)):
-            if not all(math.isfinite(v) for v in values):
-                raise ValueError(f"{label}: {name} = {values} holds a value that is not finite")
-        if not all(abs(a) >= 1e-6 for a in self.alpha):
-            raise ValueError(f"{label}: alpha = {self.alpha} holds an exponent of zero; allowed: |alpha| >= 1e-6")
-        if not 0.0 < self.shear_modulus < math.inf:
-            raise ValueError(
-                f"{label}: shear modulus 1/2 sum mu alpha = {self.shear_modulus:g} Pa; it must be positive"
-            )
+        try:
+            self.law.check(self.mu, self.alpha)
+        except ValueError as error:
+            raise ValueError(f"{label}: {error}") from None
         if not 0.0 < self.eps_r < math.inf:
             raise ValueError(f"{label}: eps_r = {self.eps_r!r}; it must be positive and finite")
         for name, limit, least in (
@@ -63,10 +62,86 @@ class Material:
             if limit is not None and not least < limit < math.inf:
                 raise ValueError(f"{label}: {name} = {limit!r}; it must be above {least:g} and finite, or None")
 
+    @classmethod
+    def with_law(
+        cls,
+        name: str,
+        law: type[Law],
+        values: Mapping[str, float | Sequence[float]],
+        eps_r: float,
+        *,
+        breakdown_field: float | None = None,
+        max_stretch: float | None = None,
+        source: str = "",
+    ) -> Self:
+        """A material from the law's own names, e.g. ``{"mu": 5e4, "Jm": 40}``; in a series one list a name.
+
+        Raises
+        ------
+        ValueError : a name is missing or unknown, or a value is not allowed
+        """
+        names = [p.name for p in (*law.moduli, *law.shapes)]
+        if wrong := [key for key in values if key not in names]:
+            raise ValueError(f"the law {law.name!r} has no parameter {wrong[0]!r}; it has {', '.join(names)}")
+        if missing := [key for key in names if key not in values]:
+            raise ValueError(f"the law {law.name!r} needs {', '.join(missing)}")
+
+        def numbers(key: str) -> list[float]:
+            value = values[key]
+            return [float(value)] if isinstance(value, int | float) else [float(v) for v in value]
+
+        if law.series and len(counts := {key: len(numbers(key)) for key in names}) and len(set(counts.values())) > 1:
+            told = " and ".join(f"{key} has {count}" for key, count in counts.items())
+            raise ValueError(f"{told} entries; give one of each per term")
+        return cls(
+            name,
+            tuple(v for p in law.moduli for v in numbers(p.name)),
+            tuple(v for p in law.shapes for v in numbers(p.name)),
+            eps_r,
+            breakdown_field,
+            max_stretch,
+            source,
+            law,
+        )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Every parameter by the name that results call it: "mu1", "alpha1" of the first Ogden term, "Jm"."""
+        return dict(zip(self.law.names(len(self.mu), len(self.alpha)), (*self.mu, *self.alpha), strict=True))
+
+    def with_value(self, name: str, value: float) -> Material:
+        """The material with another value of one parameter, named as in ``values``, or of "eps_r".
+
+        Raises
+        ------
+        ValueError : there is no such parameter, or the value is not allowed
+        """
+        if name == "eps_r":
+            return replace(self, eps_r=value)
+        names = list(self.values)
+        if name not in names:
+            raise ValueError(f"{name!r} is no parameter of the material; it has {', '.join(names)}, eps_r")
+        numbers = [*self.mu, *self.alpha]
+        numbers[names.index(name)] = value
+        return replace(self, mu=tuple(numbers[: len(self.mu)]), alpha=tuple(numbers[len(self.mu) :]))
+
+    @property
+    def powers(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """The law as Ogden terms: moduli (Pa) and exponents.
+
+        Raises
+        ------
+        ValueError : it is no sum of powers of the stretches
+        """
+        terms = self.law.powers(self.mu, self.alpha)
+        if terms is None:
+            raise ValueError(f"material {self.name!r}: the law {self.law.name!r} is no sum of powers of the stretches")
+        return tuple(terms[0]), tuple(terms[1])
+
     @cached_property
     def shear_modulus(self) -> float:
-        """Small-strain shear modulus ``G = 1/2 sum mu_n alpha_n`` (Pa)."""
-        return 0.5 * math.fsum(m * a for m, a in zip(self.mu, self.alpha, strict=True))
+        """Small-strain shear modulus G (Pa)."""
+        return self.law.shear_modulus(self.mu, self.alpha)
 
     @property
     def permittivity(self) -> float:

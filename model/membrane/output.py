@@ -182,7 +182,7 @@ def extremes(problem: Problem, grid: Grid, state: State, at: Points, lam: Array)
 
 @dataclass(slots=True)
 class Derivatives:
-    """Derivatives of the dimensionless force ``lam``: (S,), the two first (terms, S)."""
+    """Derivatives of the dimensionless force ``lam``: (S,), the two first (moduli, S) and (shape parameters, S)."""
 
     mu: Array
     alpha: Array
@@ -213,10 +213,7 @@ def derivatives(
     w1, w2 = grid.twice * d1, grid.twice * d2
     w3 = -(w1 + w2)
     log = at.log
-    rates = np.stack((w1, w2, w3))
-    powers = film.powers(log)
-    mu = (powers * rates).sum(axis=(1, 2, 3))
-    alpha = film.mu * ((powers + 1.0) * (log * rates)).sum(axis=(1, 2, 3))
+    mu, alpha = film.law.projected(log, w1, w2)
     maxwell = np.zeros_like(lam) if law.maxwell is None else (law.maxwell * w3).sum(axis=(0, 1))
     prestretch = ((law.h11 + law.h12) * w1 + (law.h12 + law.h22) * w2).sum(axis=(0, 1))
 

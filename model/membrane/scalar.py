@@ -179,7 +179,7 @@ class Solver:
         """Add a taut element to ``system``; its strains, and what its slopes follow with."""
         film, tables, dxi, cut = self.film, self.tables, panel.dxi, bool(self.cones)
         points = tables.points
-        lnlp, terms, field = film.log_prestretch, film.terms, film.field
+        lnlp, law, field = film.log_prestretch, film.law, film.field
         strain = panel.strain
         self.count.mechanical += points
         if field != 0.0:
@@ -191,26 +191,16 @@ class Solver:
         kept = []
         turns = []
         tension = []
-        for i, (slope, once, radius) in enumerate(zip(panel.w, panel.once, panel.radius, strict=True)):
-            e = strain[i]
-            q = e + strain[points + i] * dxi
+        places = zip(panel.w, panel.once, panel.radius, strain[:points], strain[points:], strict=True)
+        for i, (slope, once, radius, e, rise) in enumerate(places):
+            q = e + rise * dxi
             g = q * (q + 2.0) + slope * slope
             metric = 1.0 + g
             log1 = 0.5 * log1p(g) + lnlp
             log2 = log1p(e) + lnlp
-            log3 = -(log1 + log2)
-            t1 = t2 = 0.0
-            h11 = h22 = 4.0
-            h12 = 2.0
-            for mu, alpha, product in terms:
-                x, y, z = expm1(alpha * log1), expm1(alpha * log2), expm1(alpha * log3)
-                t1 += mu * (x - z)
-                t2 += mu * (y - z)
-                h11 += product * (x + z)
-                h22 += product * (y + z)
-                h12 += product * z
+            t1, t2, h11, h12, h22 = law(log1, log2)
             if field != 0.0:
-                b = field * exp(-2.0 * log3)
+                b = field * exp(2.0 * (log1 + log2))
                 t1 -= b
                 t2 -= b
                 rest = max(rest, abs(b / t1))

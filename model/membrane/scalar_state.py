@@ -10,6 +10,7 @@ from math import exp, expm1, log1p
 import numpy as np
 
 from model.arrays import Array
+from model.material.law import Point
 from model.membrane import output, ritz, wrinkled_cone
 
 Floats = list[float]
@@ -19,7 +20,7 @@ Floats = list[float]
 class Film:
     """One state, dimensionless."""
 
-    terms: tuple[tuple[float, float, float], ...]  # mu/G, alpha, their product
+    law: Point  # stresses and tangents over G at two log stretches
     field: float  # eps (V/T)^2 / G
     log_prestretch: float
     span: float
@@ -146,20 +147,10 @@ def places(modes: int, elements: int, taut: tuple[int, ...]) -> list[list[int]]:
 
 def stress(film: Film, log1: float, log2: float) -> tuple[float, float, float, float, float, float]:
     """t1, t2, h11, h12, h22 and the Maxwell stress; see `model.material.law`."""
-    log3 = -(log1 + log2)
-    t1 = t2 = 0.0
-    h11 = h22 = 4.0  # sum mu alpha = 2 in units of G
-    h12 = 2.0
-    for mu, alpha, product in film.terms:
-        x, y, z = expm1(alpha * log1), expm1(alpha * log2), expm1(alpha * log3)
-        t1 += mu * (x - z)
-        t2 += mu * (y - z)
-        h11 += product * (x + z)
-        h22 += product * (y + z)
-        h12 += product * z
+    t1, t2, h11, h12, h22 = film.law(log1, log2)
     if film.field == 0.0:
         return t1, t2, h11, h12, h22, 0.0
-    b = film.field * exp(-2.0 * log3)
+    b = film.field * exp(2.0 * (log1 + log2))
     return t1 - b, t2 - b, h11 - 2.0 * b, h12 - 2.0 * b, h22 - 2.0 * b, b
 
 

@@ -77,7 +77,8 @@ class Solutions:
     stable : the energy has a minimum here
     field_exceeded, stretch_exceeded : above the material's stated limits (False where it states none)
     dforce : derivatives of the force with respect to "h", "voltage", "disk_radius", "ring_radius", "thickness",
-        "prestretch", "eps_r" (shape S) and "mu", "alpha" (shape S + (terms,)); None unless asked for
+        "prestretch", "eps_r" (shape S) and "mu", "alpha" (shape S + (moduli,) and S + (shape parameters,), as in
+        `model.material.materials.Material`); None unless asked for
     evaluations : how many points of the material's law were computed
     """
 
@@ -233,6 +234,10 @@ class _Inputs:
         charged = self.voltage[index] != 0.0
         groups = [index] if charged.all() or not charged.any() else [index[~charged], index[charged]]
         of_film = np.log([s.ring_radius / s.disk_radius for s in self.specimens])
+        laws = {s.material.law for s in self.specimens}
+        if len(laws) > 1:
+            of_law = np.array([list(laws).index(s.material.law) for s in self.specimens])
+            groups = [group[of_law[self.which[group]] == k] for group in groups for k in range(len(laws))]
         for group in groups:
             spans = of_film[self.which[group]]
             if len(self.specimens) > 1:
@@ -246,10 +251,11 @@ class _Inputs:
 
 
 def _padded(materials: Sequence[tuple[float, ...]], fill: float) -> Array:
+    """Parameters of films of one law, (parameters, films): a series of fewer terms is filled up."""
     terms = max(map(len, materials))
     if any(len(values) < terms for values in materials):
         materials = [values + (fill,) * (terms - len(values)) for values in materials]
-    return np.array(materials).T
+    return np.array(materials, dtype=float).reshape(len(materials), terms).T
 
 
 def solve_many(
@@ -316,7 +322,7 @@ def _quick(
         return None
     shear = m.shear_modulus
     film = OneFilm(
-        terms=tuple((mu / shear, alpha, mu / shear * alpha) for mu, alpha in zip(m.mu, m.alpha, strict=True)),
+        law=m.law.point([mu / shear for mu in m.mu], m.alpha),
         field=m.permittivity * (voltage / t) ** 2 / shear,
         log_prestretch=math.log(lp),
         span=math.log(b / specimen.disk_radius),
@@ -360,7 +366,13 @@ def _solve(
 ) -> tuple[Solutions, list[tuple[NDArray[np.intp], Solved]]]:
     """The solutions, and with ``keep`` the states themselves."""
     _check(tolerance, wrinkling)
-    result = _Flat(len(inputs.h), max((len(s.material.mu) for s in inputs.specimens), default=1), sensitivities, keep)
+    result = _Flat(
+        len(inputs.h),
+        max((len(s.material.mu) for s in inputs.specimens), default=1),
+        max((len(s.material.alpha) for s in inputs.specimens), default=1),
+        sensitivities,
+        keep,
+    )
     count = Evaluations()
     with np.errstate(all="ignore"):
         for index in inputs.blocks():
@@ -418,7 +430,7 @@ def solve(
 class _Flat:
     """The results while they are being filled, one entry a state."""
 
-    def __init__(self, states: int, terms: int, sensitivities: bool, keep: bool) -> None:
+    def __init__(self, states: int, moduli: int, shapes: int, sensitivities: bool, keep: bool) -> None:
         self.real = {
             name: np.full(states, np.nan)
             for name in (
@@ -442,7 +454,7 @@ class _Flat:
         if sensitivities:
             names = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
             self.dforce = {name: np.full(states, np.nan) for name in names}
-            self.dforce |= {name: np.full((states, terms), np.nan) for name in ("mu", "alpha")}
+            self.dforce |= {"mu": np.full((states, moduli), np.nan), "alpha": np.full((states, shapes), np.nan)}
 
     def solutions(self, shape: tuple[int, ...], count: Evaluations) -> Solutions:
         dforce = None
@@ -465,7 +477,7 @@ class _Block:
         used, pick = np.unique(inputs.which[index], return_inverse=True)
         films = [inputs.specimens[i] for i in used.tolist()]
         materials = [s.material for s in films]
-        self.terms = np.array([len(m.mu) for m in materials], dtype=np.intp)[pick]
+        self.moduli, self.shapes = np.array([(len(m.mu), len(m.alpha)) for m in materials], dtype=np.intp)[pick].T
         numbers = np.array(
             [
                 (
@@ -488,8 +500,7 @@ class _Block:
             mu, alpha = mu[:, pick], alpha[:, pick]
         charged = bool(np.any(self.voltage))
         film = Film(
-            mu=mu / (self.shear if len(films) > 1 else self.shear[:1]),
-            alpha=alpha,
+            law=materials[0].law(mu / (self.shear if len(films) > 1 else self.shear[:1]), alpha),
             field=EPSILON_0 * self.eps_r * (self.voltage / self.t) ** 2 / self.shear if charged else None,
             count=count,
         )
@@ -633,7 +644,6 @@ class _Block:
         f["thickness"][to] = (force - 2.0 * scale * d.log_field) / t
         f["disk_radius"][to] = -scale * d.span / self.a[where]
         f["ring_radius"][to] = (force - h * slope + scale * d.span) / b
-        absent = np.arange(d.mu.shape[0])[:, None] >= self.terms[where]
-        terms = d.mu.shape[0]
-        f["mu"][to, :terms] = np.where(absent, np.nan, scale / shear * d.mu).T
-        f["alpha"][to, :terms] = np.where(absent, np.nan, scale * d.alpha).T
+        for name, values, given in (("mu", scale / shear * d.mu, self.moduli), ("alpha", scale * d.alpha, self.shapes)):
+            absent = np.arange(len(values))[:, None] >= given[where]
+            f[name][to, : len(values)] = np.where(absent, np.nan, values).T

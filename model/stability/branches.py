@@ -76,7 +76,8 @@ class _Path:
             raise ValueError(f"voltage = {voltage!r} V: it must not be negative, and finite")
         full = m.permittivity * (voltage / specimen.thickness) ** 2 / shear
         self.full_field, self.full_height = full, h / specimen.ring_radius
-        film = Film(np.array(m.mu)[:, None] / shear, np.array(m.alpha)[:, None], np.array([full]), Evaluations())
+        law = m.law(np.array(m.mu)[:, None] / shear, np.array(m.alpha)[:, None])
+        film = Film(law, np.array([full]), Evaluations())
         self.problem = Problem(
             film,
             np.array([math.log(specimen.prestretch)]),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import Array
+from model.material.law import stack
 from model.membrane.solve import Solutions, Status, Wrinkling, solve_many
 from model.specimen import Specimen
 from model.stability.branches import pull_in
@@ -160,8 +161,9 @@ def slack_voltage(specimen: Specimen, h: Array) -> Array:
     m = specimen.material
     mean = np.abs(h) / (specimen.ring_radius - specimen.disk_radius)
     stretch = np.log(specimen.prestretch) + 0.5 * np.log1p(mean * mean)
-    mu, alpha = (np.array(x).reshape(-1, *(1,) * stretch.ndim) for x in (m.mu, m.alpha))
-    tension = (mu * (np.expm1(alpha * stretch) - np.expm1(-2.0 * alpha * stretch))).sum(axis=0)
+    law = m.law(np.array(m.mu)[:, None], np.array(m.alpha)[:, None])
+    log = np.atleast_1d(stretch)
+    tension = law.derivatives(stack(log, log))[0].reshape(stretch.shape)
     return np.asarray(np.sqrt(np.maximum(tension, 0.0) / m.permittivity) * specimen.thickness * np.exp(-2.0 * stretch))
 
 

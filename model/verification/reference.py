@@ -99,6 +99,7 @@ def reference(
     ``wrinkling`` is ``"plain"`` (the equations of Cao & Conn 2018, whatever the sign of the hoop stress) or
     ``"tension_field"``. Force and extremes are good to about 1e-12 relative where ``converged`` is set. Where hoop
     tension is lost the plain equations have answers that no film has: given then is the branch that leads there.
+    The series are sums of exponentials: a law that is no sum of powers of the stretches raises ValueError.
     """
     if wrinkling not in ("plain", "tension_field"):
         raise ValueError(f'wrinkling is "{wrinkling}"; allowed are "plain" and "tension_field"')
@@ -117,11 +118,11 @@ def reference(
 
 
 def _solve_block(films: list[Specimen], h: Array, voltage: Array, relaxed: bool) -> tuple[Array, ...]:
-    terms = max(len(film.material.mu) for film in films)
+    powers = [film.material.powers for film in films]
+    terms = max(len(moduli) for moduli, _ in powers)
     mu, alpha = np.zeros((terms, len(films))), np.ones((terms, len(films)))
-    for i, film in enumerate(films):
-        mu[: len(film.material.mu), i] = film.material.mu
-        alpha[: len(film.material.alpha), i] = film.material.alpha
+    for i, (moduli, exponents) in enumerate(powers):
+        mu[: len(moduli), i], alpha[: len(moduli), i] = moduli, exponents
     scale = 0.5 * np.sum(mu * alpha, axis=0)
     ring = np.array([film.ring_radius for film in films])
     disk = np.array([film.disk_radius for film in films])

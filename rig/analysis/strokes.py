@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -234,20 +234,12 @@ def _expectation(
 
 def _value(material: Material, name: str) -> float:
     """The parameter ``name`` ("mu1", "alpha1", "eps_r")."""
-    if name == "eps_r":
-        return material.eps_r
-    key = name.rstrip("0123456789")
-    return float(getattr(material, key)[int(name.removeprefix(key)) - 1])
+    return material.eps_r if name == "eps_r" else material.values[name]
 
 
 def _nudged(material: Material, name: str, factor: float) -> Material:
     """The material with the parameter ``name`` multiplied by ``factor``."""
-    if name == "eps_r":
-        return replace(material, eps_r=material.eps_r * factor)
-    key = name.rstrip("0123456789")
-    values = list(getattr(material, key))
-    values[int(name.removeprefix(key)) - 1] *= factor
-    return replace(material, mu=tuple(values)) if key == "mu" else replace(material, alpha=tuple(values))
+    return material.with_value(name, factor * _value(material, name))
 
 
 def _expected(actuator: Actuator, voltage: float) -> tuple[float, float]:

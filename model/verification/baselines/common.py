@@ -75,6 +75,8 @@ _QUARTIC = np.linalg.inv(np.vander(np.arange(5.0), increasing=True))
 class Film:
     """A film in units of its ring radius and shear modulus.
 
+    Its law must be a sum of powers of the stretches: another raises ValueError.
+
     ``disk`` = a/b, ``height`` = h/b, ``terms`` = pairs (mu/G, alpha), ``electric`` = eps (V/T)^2 / G.
     """
 
@@ -86,8 +88,9 @@ class Film:
         self.disk = specimen.disk_radius / specimen.ring_radius
         self.lp = specimen.prestretch
         self.height = h / specimen.ring_radius
-        self.mu = np.array(material.mu) / shear
-        self.alpha = np.array(material.alpha)
+        moduli, exponents = material.powers
+        self.mu = np.array(moduli) / shear
+        self.alpha = np.array(exponents)
         self.terms = tuple(zip(self.mu.tolist(), self.alpha.tolist(), strict=True))
         self.electric = material.permittivity * (voltage / specimen.thickness) ** 2 / shear
 

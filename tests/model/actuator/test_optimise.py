@@ -54,7 +54,7 @@ def test_quantities_of_a_point_are_read_and_changed_by_name() -> None:
         read(SPRING, "weight")
     with pytest.raises(ValueError, match="known are"):
         read(SPRING, "colour")
-    with pytest.raises(ValueError, match="2 Ogden terms"):
+    with pytest.raises(ValueError, match=r"known are .*mu2, alpha1"):
         read(SPRING, "mu3")
     with pytest.raises(ValueError, match="must rise"):
         Task(SPRING, {"prestretch": (1.3, 1.0)})

@@ -27,8 +27,7 @@ def test_error_falls_exponentially_with_the_modes(disk: float, lp: float, h: flo
     shear = PARKER.shear_modulus
     field = PARKER.permittivity * (v / 40e-6) ** 2 / shear
     film = Film(
-        np.array(PARKER.mu)[:, None] / shear,
-        np.array(PARKER.alpha)[:, None],
+        PARKER.law(np.array(PARKER.mu)[:, None] / shear, np.array(PARKER.alpha)[:, None]),
         np.array([field]) if v else None,
         Evaluations(),
     )
@@ -45,7 +44,7 @@ def test_error_falls_exponentially_with_the_modes(disk: float, lp: float, h: flo
 def test_newton_converges_with_the_square() -> None:
     """Each step's largest change is of the order of the square of the last one's."""
     shear = PARKER.shear_modulus
-    film = Film(np.array(PARKER.mu)[:, None] / shear, np.array(PARKER.alpha)[:, None], None, Evaluations())
+    film = Film(PARKER.law(np.array(PARKER.mu)[:, None] / shear, np.array(PARKER.alpha)[:, None]), None, Evaluations())
     problem = Problem(film, np.log([1.2]), np.log([10.0]), np.array([0.5]))
     grid = Grid.lay(8, problem.cut())
     state = ritz.guess(problem, grid)

@@ -107,8 +107,7 @@ def test_cut_at_the_kink_keeps_spectral_convergence() -> None:
     truth = reference(film(), h, v, wrinkling="tension_field").force[0]
     shear = PARKER.shear_modulus
     material = Film(
-        np.array(PARKER.mu)[:, None] / shear,
-        np.array(PARKER.alpha)[:, None],
+        PARKER.law(np.array(PARKER.mu)[:, None] / shear, np.array(PARKER.alpha)[:, None]),
         np.array([PARKER.permittivity * (v / 40e-6) ** 2 / shear]),
         Evaluations(),
     )
