@@ -133,9 +133,9 @@ def _open_port(port: str, baud: int) -> ByteLink:
 
 
 def _open_bus(bus: Bus) -> FrameLink:
-    from drivers.links.can_link import CanLink
+    from drivers.links.can_link import open_bus
 
-    return CanLink("devices", *bus)
+    return open_bus("devices", *bus)
 
 
 # -- serial ports ------------------------------------------------------------------------------------------------------

@@ -6,6 +6,8 @@ reference page (``dea-rig keys``), the editor's completion and the error message
 
 from __future__ import annotations
 
+import socket
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -62,8 +64,15 @@ class InstrumentSettings(Table):
         """How often it is to give a sample (Hz)."""
         return float(getattr(self, self.rate_key))
 
-    def open(self, name: str) -> ByteLink | FrameLink:
+    @property
+    def two_may_hold(self) -> bool:
+        """Whether two processes may have the link at once: one opens it, and the other adopts it or opens it too."""
+        return hasattr(socket, "send_fds")
+
+    def open(self, name: str, adopt: Sequence[int] = ()) -> ByteLink | FrameLink:
         """Open the port or bus; sends nothing to the instrument. ``name`` is the instrument's in messages.
+
+        ``adopt`` are the descriptors of one that another process has opened, as the links give them.
 
         Raises
         ------
@@ -85,11 +94,11 @@ class SerialSettings(InstrumentSettings):
     )
     baud: int = Field(default=115_200, gt=0, description="Line rate (bit/s), as set in the instrument.")
 
-    def open(self, name: str) -> ByteLink:
+    def open(self, name: str, adopt: Sequence[int] = ()) -> ByteLink:
         from drivers.links.serial_link import SerialLink
 
         assert self.port is not None
-        return SerialLink(name, self.port, self.baud)
+        return SerialLink(name, self.port, self.baud, adopt=adopt)
 
 
 class CanSettings(InstrumentSettings):
@@ -113,11 +122,17 @@ class CanSettings(InstrumentSettings):
             raise ValueError("interface and can_channel belong together: give both or neither")
         return self
 
-    def open(self, name: str) -> FrameLink:
-        from drivers.links.can_link import CanLink
+    @property
+    def two_may_hold(self) -> bool:
+        from drivers.links.can_link import SHARED
+
+        return super().two_may_hold if self.interface == "slcan" else self.interface in SHARED
+
+    def open(self, name: str, adopt: Sequence[int] = ()) -> FrameLink:
+        from drivers.links.can_link import open_bus
 
         assert self.interface is not None and self.can_channel is not None
-        return CanLink(name, self.interface, self.can_channel, self.bitrate)
+        return open_bus(name, self.interface, self.can_channel, self.bitrate, adopt=adopt)
 
 
 class StageSettings(InstrumentSettings):

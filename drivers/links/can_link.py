@@ -1,5 +1,5 @@
 """CAN bus through python-can, as a `drivers.links.link.FrameLink`: never waits, survives garbage, says when the bus is
-gone.
+gone. `open_bus` gives the link of any interface; slcan adapters have one of their own, in `drivers.links.slcan_link`.
 
 python-can is imported when a bus is opened, not before. No thread, no Notifier, no periodic sending: frames move only
 when the owner calls ``read`` or ``write``.
@@ -8,13 +8,15 @@ when the owner calls ``read`` or ``write``.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
+import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from drivers.links.link import CanFrame, DeviceLost, DeviceRefused
-from drivers.links.serial_link import PortLock
+from drivers.links.slcan_link import SlcanLink
 
 if TYPE_CHECKING:
     import can
@@ -24,11 +26,10 @@ INTERFACES = ("socketcan", "slcan", "pcan", "vector", "virtual", "udp_multicast"
 SHARED = ("socketcan", "udp_multicast")
 """Interfaces that several programs of one computer may open at once."""
 
-# What an interface needs beyond channel and bit rate. slcan: python-can would sleep 2 s after opening for boards that
-# reset, and wait 1 ms at each look for input. vector: channels are counted over all its adapters. udp_multicast: frames
-# stay on this computer. virtual and udp_multicast have no bit rate; socketcan has its own from the system.
+# What an interface needs beyond channel and bit rate. vector: channels are counted over all its adapters.
+# udp_multicast: frames stay on this computer. virtual and udp_multicast have no bit rate; socketcan has its own from
+# the system.
 _OPTIONS: dict[str, dict[str, Any]] = {
-    "slcan": {"sleep_after_open": 0, "timeout": 0},
     "vector": {"app_name": None},
     "udp_multicast": {"hop_limit": 0, "fd": False},
 }
@@ -36,7 +37,6 @@ _WITHOUT_BITRATE = {"socketcan", "virtual", "udp_multicast"}
 
 _ADVICE = {
     "socketcan": "It is Linux only; bring it up first: ip link set can0 up type can bitrate 125000.",
-    "slcan": "The channel is the adapter's serial port; check that nothing else uses it.",
     "pcan": "Install PEAK's PCAN-Basic driver; channels are named PCAN_USBBUS1 and so on.",
     "vector": "It needs Windows and Vector's XL driver library; the channel is a number, from 0.",
     "udp_multicast": "It needs the package msgpack (extra `multicast`), and a multicast address such as 239.74.163.2.",
@@ -44,9 +44,11 @@ _ADVICE = {
 
 _NOWHERE = logging.NullHandler()
 _BUS_OFF = 0x40  # SocketCAN's error class CAN_ERR_BUSOFF in the identifier of an error frame
-_MOST_LOOKS = 4096  # in one read: some 4 s of a full 125 kbit/s bus
-# pyserial takes a process that was kept waiting for the processor for a port that takes no data, although all has gone.
-_SEND_TIMEOUT_S = 0.5
+_MOST_LOOKS = 256  # in one read, which may then take some milliseconds; the rest waits for the next
+_MOST_SENT = 4096  # frames whose echo is waited for
+_LOOK_AGAIN_S = 0.05  # how often a lost bus is looked for
+TAKES_S = 0.5  # an interface that takes no frame for so long is lost
+MOST_WAITING = 64  # frames that wait to be taken
 
 
 class CanLink:
@@ -54,20 +56,18 @@ class CanLink:
 
     Counters: ``frames_read``, ``frames_written``, ``foreign_frames`` (identifier not in ``accept``, or not a classic
     11-bit data frame), ``error_frames``, ``own_echoes`` (what udp_multicast brings back to its sender) and ``garbage``
-    (what the interface could not make a frame of).
-
-    Frames on slcan carry no checksum between adapter and host: a corrupted hexadecimal digit is a different frame. What
-    is not hexadecimal, or shorter than its length says, is dropped and counted.
+    (what the interface could not make a frame of). A frame for which the interface has no room waits here and goes out
+    with the next call; when none is taken for `TAKES_S` the bus counts as lost.
 
     Parameters
     ----------
     name : str
         Name of the device that is on it, for error messages; the link's own ``name`` is interface and channel.
     interface : str
-        One of `INTERFACES`: which python-can backend.
+        One of `INTERFACES` but slcan: which python-can backend.
     channel : str
-        "can0" (socketcan), a serial port (slcan), "PCAN_USBBUS1" (pcan), a number (vector), any name (virtual), a
-        multicast address (udp_multicast).
+        "can0" (socketcan), "PCAN_USBBUS1" (pcan), a number (vector), any name (virtual), a multicast address
+        (udp_multicast).
     bitrate : int
         Bits per second.
     accept : collection of int, optional
@@ -84,6 +84,7 @@ class CanLink:
         bitrate: int = 125_000,
         *,
         accept: Collection[int] | None = None,
+        clock: Callable[[], float] = time.monotonic,
         **options: Any,
     ) -> None:
         self.name = f"{interface} {channel}"
@@ -93,36 +94,33 @@ class CanLink:
         self._where = f"{name} ({self.name})"
         self._accept = None if accept is None else frozenset(accept)
         self._echoing = interface == "udp_multicast"
-        self._sent: deque[CanFrame] = deque(maxlen=_MOST_LOOKS)  # whose echo has not come yet
-        self._lock: PortLock | None = None
-        self._bus: can.BusABC | None = self._open(interface, channel, bitrate, options)
+        self._sent: deque[CanFrame] = deque(maxlen=_MOST_SENT)  # whose echo has not come yet
+        self._clock = clock
+        self._waiting: deque[CanFrame] = deque()  # frames that the interface had no room for
+        self._taken_at = clock()
+        self._next_look = clock()
+        self._arguments = interface, channel, bitrate, options
+        self._closed = False
+        self._bus: can.BusABC | None = self._open(*self._arguments)
 
     def _open(self, interface: str, channel: str, bitrate: int, options: dict[str, Any]) -> can.BusABC:
-        if interface not in INTERFACES:
-            raise DeviceRefused(
-                self._where, f"there is no CAN interface {interface!r}", f"Allowed: {', '.join(INTERFACES)}."
-            )
         import can
 
         _quiet()
         options = _OPTIONS.get(interface, {}) | options
         if interface not in _WITHOUT_BITRATE:
             options["bitrate"] = bitrate
-        # Another program on the same adapter would be heard and answered as if it were us.
-        self._lock = PortLock(self._where, channel.partition("@")[0]) if interface == "slcan" else None
         try:
             return can.Bus(
                 channel=channel, interface=interface, ignore_config=True, receive_own_messages=False, **options
             )
         except can.CanInterfaceNotImplementedError as error:  # python-can's word for a backend that is not installed
-            self._release()
             raise DeviceRefused(
                 self._where,
                 f"the CAN interface cannot be used here ({error})",
                 _ADVICE.get(interface, ""),
             ) from error
         except (can.CanError, OSError, ValueError, TypeError) as error:
-            self._release()
             raise DeviceLost(
                 self._where,
                 f"the CAN channel cannot be opened ({error})",
@@ -130,21 +128,21 @@ class CanLink:
             ) from error
 
     def read(self) -> list[CanFrame]:
-        """All frames that have arrived; raises `DeviceLost` when the bus is gone or off."""
+        """The frames that have arrived, at most some hundred; raises `DeviceLost` when the bus is gone or off."""
         bus = self._open_bus()
+        self._send_waiting(bus)
         frames: list[CanFrame] = []
         for _ in range(_MOST_LOOKS):
             try:
                 message = bus.recv(0)
             except Exception as error:
                 self.counters["garbage"] += 1
-                self._survive(bus, error)
+                self._survive(error)
                 continue
             if message is not None:
                 if (frame := self._frame(message)) is not None:
                     frames.append(frame)
-            # python-can also returns nothing for an adapter's acknowledgement, with frames waiting behind it.
-            elif not self._more_waits(bus):
+            else:
                 break
         self.counters["frames_read"] += len(frames)
         if _state(bus) == "ERROR":
@@ -152,34 +150,68 @@ class CanLink:
         return frames
 
     def write(self, frame: CanFrame) -> None:
-        """Send one frame; raises `DeviceLost` when it cannot be sent."""
+        """Send one frame, or keep it while there is no room; raises `DeviceLost` when it cannot be sent."""
+        bus = self._open_bus()
+        if not self._waiting:
+            self._taken_at = self._clock()
+        if frame not in self._waiting:  # an off that is repeated need not wait twice
+            self._waiting.append(frame)
+        self._send_waiting(bus)
+
+    def _send_waiting(self, bus: can.BusABC) -> None:
         import can
 
-        bus = self._open_bus()
-        if self._echoing:
-            self._sent.append(frame)
+        while self._waiting:
+            frame = self._waiting[0]
+            try:
+                bus.send(
+                    can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False, check=True), timeout=0
+                )
+            except (can.CanError, OSError) as error:
+                late = self._clock() - self._taken_at > TAKES_S or len(self._waiting) > MOST_WAITING
+                if _no_room(error) and not late:
+                    return
+                self._waiting.clear()
+                raise self._lost(f"a frame cannot be sent ({error})") from error
+            self._waiting.popleft()
+            self._taken_at = self._clock()
+            if self._echoing:
+                self._sent.append(frame)
+            self.counters["frames_written"] += 1
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """None: the libraries behind python-can do not hand a bus over to another process."""
+        return ()
+
+    def reopen(self) -> bool:
+        """Open a lost bus again if it is back under its name, at most every 50 ms; True when it is open."""
+        now = self._clock()
+        if self._closed or now < self._next_look:
+            return False
+        self._next_look = now + _LOOK_AGAIN_S
+        self._let_go()
+        self._waiting.clear()
         try:
-            bus.send(
-                can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False, check=True),
-                timeout=_SEND_TIMEOUT_S,
-            )
-        except (can.CanError, OSError) as error:
-            raise self._lost(f"a frame cannot be sent ({error})") from error
-        self.counters["frames_written"] += 1
+            self._bus = self._open(*self._arguments)
+        except (DeviceLost, DeviceRefused):
+            return False
+        return True
+
+    def resume(self) -> None:
+        """Nothing of a predecessor is left on a bus of one's own."""
 
     def close(self) -> None:
+        """Release the bus. Calling it twice does no harm."""
+        self._closed = True
+        self._let_go()
+
+    def _let_go(self) -> None:
         bus, self._bus = self._bus, None
         if bus is not None:
-            # A port that has vanished cannot be closed in order, but must be let go of.
+            # A bus that has vanished cannot be closed in order, but must be let go of.
             with contextlib.suppress(Exception):
                 bus.shutdown()
-            with contextlib.suppress(Exception):
-                _serial_port(bus).close()
-        self._release()
-
-    def _release(self) -> None:
-        if self._lock is not None:
-            self._lock.release()
 
     def _open_bus(self) -> can.BusABC:
         if self._bus is None:
@@ -217,31 +249,37 @@ class CanLink:
         self.counters["own_echoes"] += 1
         return True
 
-    def _survive(self, bus: can.BusABC, error: Exception) -> None:
-        """Go on after garbage; raise `DeviceLost` when the port has vanished.
-
-        python-can's slcan wraps everything in CanOperationError. A byte that is not ASCII stays in its line buffer
-        and fails every later read until the buffer is flushed.
-        """
+    def _survive(self, error: Exception) -> None:
+        """Go on after garbage; raise `DeviceLost` when the bus has vanished."""
         cause = error.__cause__ or error
         if self._echoing and cause is not error and not isinstance(cause, OSError):
             return  # any program may send any datagram to the group
-        if isinstance(cause, UnicodeDecodeError):
-            with contextlib.suppress(Exception):
-                bus.flush()  # type: ignore[attr-defined]
-                return
-        elif isinstance(cause, (ValueError, IndexError, KeyError)):
+        if isinstance(cause, (ValueError, IndexError, KeyError)):
             return
         raise self._lost(f"the CAN channel is gone ({cause})") from error
 
-    def _more_waits(self, bus: can.BusABC) -> bool:
-        port = _serial_port(bus)
-        if port is None:
-            return False
-        try:
-            return bool(port.in_waiting)
-        except Exception as error:
-            raise self._lost(f"the CAN channel is gone ({error})") from error
+
+def open_bus(
+    name: str,
+    interface: str,
+    channel: str,
+    bitrate: int = 125_000,
+    *,
+    adopt: Sequence[int] = (),
+) -> CanLink | SlcanLink:
+    """The link of any interface; ``adopt`` as `drivers.links.slcan_link.SlcanLink` takes it.
+
+    Raises
+    ------
+    DeviceError
+        It cannot be opened, is in use, or there is no such interface.
+    """
+    if interface == "slcan":
+        return SlcanLink(name, channel, bitrate, adopt=adopt)
+    if interface not in INTERFACES:
+        where = f"{name} ({interface} {channel})"
+        raise DeviceRefused(where, f"there is no CAN interface {interface!r}", f"Allowed: {', '.join(INTERFACES)}.")
+    return CanLink(name, interface, channel, bitrate)
 
 
 def channels() -> list[tuple[str, str]]:
@@ -258,9 +296,10 @@ def _quiet() -> None:
     logging.getLogger("can").addHandler(_NOWHERE)
 
 
-def _serial_port(bus: can.BusABC) -> Any:
-    """The serial port under an slcan bus; None for other interfaces."""
-    return getattr(bus, "serialPortOrig", None)
+def _no_room(error: Exception) -> bool:
+    """Whether an interface only had no room for a frame."""
+    number = getattr(error, "error_code", None) or getattr(error, "errno", None)
+    return number in (errno.ENOBUFS, errno.EAGAIN) or "full" in str(error).lower()
 
 
 def _state(bus: can.BusABC) -> str:

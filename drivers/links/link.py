@@ -26,7 +26,11 @@ class ByteLink(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send all of ``data``."""
+        """Send all of ``data``; what the port does not take at once goes out later."""
+        ...
+
+    def reopen(self) -> bool:
+        """Look whether a port that was lost is back, now and then; True when it has been opened again."""
         ...
 
     def close(self) -> None:
@@ -44,7 +48,11 @@ class FrameLink(Protocol):
         ...
 
     def write(self, frame: CanFrame) -> None:
-        """Send one frame."""
+        """Send one frame; one for which there is no room goes out later."""
+        ...
+
+    def reopen(self) -> bool:
+        """As `ByteLink.reopen`."""
         ...
 
     def close(self) -> None:

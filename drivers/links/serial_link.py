@@ -1,113 +1,43 @@
-"""Serial ports through pyserial: never waiting, opened for us alone, and gone in one way only.
+"""Serial ports: never waiting, opened for us alone, gone in one way only, and found again by the same identity.
 
-What is framed, and how, is the codecs' business: `SerialLink.read` returns whatever has arrived.
+pyserial opens and sets up the port; bytes then go through the bare descriptor, because pyserial (like python-can above
+it) can wait for a port to take its data. What is framed, and how, is the codecs' business: `SerialLink.read` returns
+whatever has arrived.
 """
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
 import os
-import re
-import sys
-import tempfile
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivers.links.link import DeviceError, DeviceLost
+from drivers.links.port_lock import PortLock
+from drivers.links.system import GONE, Port, adopted_port, open_port
 
 if TYPE_CHECKING:
     import serial
 
-# The one place for what only some operating systems have. pyserial's own exceptions are OSErrors, except that on POSIX
-# it lets termios.error through, which is none.
-_GONE: tuple[type[Exception], ...]
-if sys.platform == "win32":
-    import msvcrt
+TAKES_S = 0.5  # a port that has taken nothing for so long, with bytes waiting, is lost
+MOST_WAITING = 4096  # bytes not taken yet: far more than any dialogue has outstanding
+LOOK_AGAIN_S = 0.05  # how often a lost port is looked for
 
-    _GONE = (OSError,)
-
-    def _lock(fd: int) -> None:
-        os.lseek(fd, 4096, os.SEEK_SET)  # beyond the text, which others may read
-        try:
-            msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
-        finally:
-            os.lseek(fd, 0, os.SEEK_SET)
-
-    def _send(port: serial.Serial, data: bytes) -> int:
-        return port.write(data) or 0
-
-else:
-    import fcntl
-    import termios
-
-    _GONE = (OSError, termios.error)
-
-    def _lock(fd: int) -> None:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-    def _send(port: serial.Serial, data: bytes) -> int:
-        # pyserial would call a process that was kept waiting for the processor a port that takes no data.
-        try:
-            return os.write(port.fileno(), data)
-        except BlockingIOError:
-            return 0
+_BY_ID = Path("/dev/serial/by-id")
 
 
-# pyserial raises the last one for a baud rate or a setting that this system's ports cannot have.
-_UNUSABLE: tuple[type[Exception], ...] = (*_GONE, ValueError, NotImplementedError)
-
-
-class PortLock:
-    """Keeps other processes, and this one, from opening the same port twice.
-
-    The operating system holds the lock on a file in the temporary directory, and lets go of it when the process that
-    had it dies, however it dies: a file that is left behind locks nothing. The file says who holds it.
-
-    Raises
-    ------
-    DeviceError
-        Somebody else has the port.
-    """
-
-    def __init__(self, device: str, port: str) -> None:
-        real = os.path.realpath(port) if os.sep in port else port.upper()
-        key = hashlib.sha256(real.encode()).hexdigest()[:12]
-        plain = re.sub(r"[^A-Za-z0-9]+", "-", Path(real).name)
-        self.path = Path(tempfile.gettempdir()) / f"dea-rig-{plain}-{key}.lock"
-        no_follow = getattr(os, "O_NOFOLLOW", 0)
-        try:
-            try:
-                self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | no_follow, 0o666)
-                ours = True
-            except PermissionError:  # left by another user; it can be locked all the same
-                self._fd = os.open(self.path, os.O_RDONLY | no_follow)
-                ours = False
-        except OSError as error:
-            raise DeviceError(
-                device, f"the lock file {self.path} cannot be opened ({error.strerror})", "Remove it."
-            ) from None
-        try:
-            _lock(self._fd)
-        except OSError:
-            holder = os.read(self._fd, 20).decode("ascii", "replace").strip()
-            os.close(self._fd)
-            who = f"process {holder}" if holder.isdecimal() else "another process"
-            raise DeviceError(
-                device, f"port {port} is in use by {who}", "End that program, or name another port in the scene."
-            ) from None
-        if ours:
-            os.ftruncate(self._fd, 0)
-            os.write(self._fd, f"{os.getpid()}\n".encode())
-
-    def release(self) -> None:
-        """Let others have the port. Calling it twice does no harm."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
+# pyserial raises the last ones for a baud rate or a setting that this system's ports cannot have.
+_UNUSABLE: tuple[type[Exception], ...] = (*GONE, ValueError, NotImplementedError)
 
 
 class SerialLink:
     """A `drivers.links.link.ByteLink` over a serial port, 8N1.
+
+    What the port does not take at once waits here, up to `MOST_WAITING` bytes, and goes out with the next call; a port
+    that takes nothing for `TAKES_S` counts as lost. ``settings`` says what was set and what the adapter made of it:
+    adapters that collect bytes for up to 16 ms before they hand them on are asked not to.
 
     Parameters
     ----------
@@ -117,11 +47,10 @@ class SerialLink:
         ``/dev/ttyUSB0``, ``COM3``; the link's own ``name``.
     baud : int
         Bits per second.
-
-    A command always fits an empty buffer, so a port that does not take all of one at once counts as lost.
-
-    ``settings`` says what was set and what the adapter made of it: adapters that collect bytes for up to 16 ms before
-    they hand them on are asked not to.
+    adopt : sequence of int, optional
+        Descriptors of a port that another process has opened, as `descriptors` gives them, in place of opening it.
+    clock : callable
+        Seconds; a real port lives in real time.
 
     Raises
     ------
@@ -129,68 +58,189 @@ class SerialLink:
         The port does not exist, is in use, or may not be opened.
     """
 
-    def __init__(self, name: str, port: str, baud: int) -> None:
-        import serial
-
+    def __init__(
+        self,
+        name: str,
+        port: str,
+        baud: int,
+        *,
+        adopt: Sequence[int] = (),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.name = port
+        self.counters = {"reopened": 0}
         self._label = f"{name} ({port})"
+        self._path, self._baud = port, baud
+        self._clock = clock
         self._closed = False
-        self._lock = PortLock(self._label, port)
-        try:
-            self._serial = serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True)
-        except _UNUSABLE as error:
-            self._lock.release()
-            raise _not_opened(self._label, port, error) from None
-        self.settings = {"port": port, "baud": str(baud), "low_latency": _ask_low_latency(self._serial)}
+        self._waiting = bytearray()
+        self._taken_at = clock()  # when the port last took something, or had nothing to take
+        self._next_look = clock()
+        self._lock: PortLock | None = None
+        self._held: tuple[int, ...] = ()  # the lock's descriptor, of an adopted port
+        self.settings = {"port": port, "baud": str(baud)}
+        if adopt:
+            first, *others = adopt
+            self._port: Port | None = adopted_port(first)
+            self._held = tuple(others)
+        else:
+            self._lock = PortLock(self._label, port)
+            try:
+                self._port = self._open(exclusive=True)
+            except _UNUSABLE as error:
+                self._lock.release()
+                raise _not_opened(self._label, port, error) from None
+        self._identity = Identity.of(port)
         timer = Path("/sys/class/tty", Path(os.path.realpath(port)).name, "device/latency_timer")
-        if timer.is_file():  # FTDI adapters on Linux
+        with contextlib.suppress(OSError):  # FTDI adapters on Linux
             self.settings["latency_timer_ms"] = timer.read_text().strip()
 
-    def read(self) -> bytes:
+    def _open(self, *, exclusive: bool | None, path: str = "") -> Port:
+        import serial
+
+        opened = serial.Serial(path or self._path, self._baud, timeout=0, write_timeout=0, exclusive=exclusive)
         try:
-            self._check_open()
-            waiting = self._serial.in_waiting
-            return bytes(self._serial.read(waiting)) if waiting else b""
-        except _GONE as error:
+            self.settings["low_latency"] = _ask_low_latency(opened)
+            return open_port(opened)
+        except BaseException:
+            opened.close()
+            raise
+
+    def read(self) -> bytes:
+        """Everything that has arrived, at most `MOST_AT_ONCE` bytes; sends what waits."""
+        try:
+            port = self._open_port()
+            self._send(port)
+            return port.read()
+        except GONE as error:
             raise self._lost("reading", error) from None
 
     def write(self, data: bytes) -> None:
+        """Send ``data``, or keep what the port does not take now."""
         try:
-            self._check_open()
-            sent = _send(self._serial, data)
-        except _GONE as error:
+            port = self._open_port()
+            if not self._waiting:
+                self._taken_at = self._clock()
+            self._waiting += data
+            self._send(port)
+        except GONE as error:
             raise self._lost("writing", error) from None
-        if sent < len(data):
-            raise DeviceLost(
-                self._label,
-                "the port takes no more data",
-                "The adapter or the device hangs: unplug it and plug it in again.",
-            )
+
+    def _send(self, port: Port) -> None:
+        if self._waiting:
+            taken = port.write(bytes(self._waiting))
+            del self._waiting[:taken]
+            now = self._clock()
+            if taken:
+                self._taken_at = now
+            if len(self._waiting) > MOST_WAITING or (self._waiting and now - self._taken_at > TAKES_S):
+                self._waiting.clear()
+                raise DeviceLost(
+                    self._label,
+                    "the port takes no more data",
+                    "The adapter or the device hangs: unplug it and plug it in again.",
+                )
 
     def fileno(self) -> int:
         """File descriptor to wait on with ``select``, on systems where serial ports have one."""
         try:
-            return int(self._serial.fileno())
-        except _GONE as error:
+            return self._open_port().fileno()
+        except GONE as error:
             raise self._lost("waiting", error) from None
 
-    def close(self) -> None:
-        self._closed = True
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """Descriptors of port and lock for another process's ``adopt``; empty where they cannot be handed over."""
+        if self._port is None or self._lock is None or os.name != "posix":
+            return ()
+        return (self._port.fileno(), self._lock.fd)
+
+    def reopen(self) -> bool:
+        """Look whether a lost port is back under the same identity, at most every `LOOK_AGAIN_S`; True when it is open.
+
+        Needs no lock. What was waiting for the port that vanished is dropped.
+        """
+        now = self._clock()
+        if self._closed or now < self._next_look:
+            return False
+        self._next_look = now + LOOK_AGAIN_S
+        path = self._identity.path(self._path)
+        if path is None:
+            return False
         try:
-            self._serial.close()
-        except _GONE:
+            port = self._open(exclusive=None, path=path)
+        except _UNUSABLE:
+            return False
+        old, self._port = self._port, port
+        if old is not None:
+            with contextlib.suppress(*GONE):
+                old.close()
+        self._waiting.clear()
+        self.counters["reopened"] += 1
+        return True
+
+    def resume(self) -> None:
+        """Take the port over from a process that may have died in the middle of a command: nothing to do for bytes."""
+
+    def close(self) -> None:
+        """Release the port. Calling it twice does no harm."""
+        self._closed = True
+        port, self._port = self._port, None
+        try:
+            if port is not None:
+                port.close()
+        except GONE:
             pass  # it is gone, which is what was wanted
         finally:
-            self._lock.release()
+            if self._lock is not None:
+                self._lock.release()
+            held, self._held = self._held, ()
+            for descriptor in held:
+                os.close(descriptor)
 
-    def _check_open(self) -> None:
-        if self._closed:  # pyserial would let a TypeError through
+    def _open_port(self) -> Port:
+        if self._port is None:
             raise OSError("it was closed")
+        return self._port
 
     def _lost(self, doing: str, error: Exception) -> DeviceLost:
         return DeviceLost(
             self._label, f"the port is gone ({doing}: {_reason(error)})", "Plug it in again, check its cable and power."
         )
+
+
+class Identity:
+    """By what a port is known again: its name in ``/dev/serial/by-id`` and the serial number of its USB adapter."""
+
+    def __init__(self, by_id: str, usb_serial: str) -> None:
+        self.by_id, self.usb_serial = by_id, usb_serial
+
+    @classmethod
+    def of(cls, port: str) -> Identity:
+        """Of a port that is there now; empty where the system knows none."""
+        real = os.path.realpath(port)
+        by_id = ""
+        with contextlib.suppress(OSError):
+            by_id = next((str(one) for one in sorted(_BY_ID.iterdir()) if os.path.realpath(one) == real), "")
+        return cls(by_id, _usb_serial(real))
+
+    def path(self, port: str) -> str | None:
+        """Where the port is now; None when it is not there, or another adapter has its name."""
+        path = self.by_id or port
+        if os.sep in path and not Path(path).exists():
+            return None
+        if self.usb_serial and _usb_serial(os.path.realpath(path)) != self.usb_serial:
+            return None
+        return path
+
+
+def _usb_serial(device: str) -> str:
+    """Serial number of the USB adapter behind a port, on Linux; empty if there is none."""
+    folder = Path(os.path.realpath(f"/sys/class/tty/{Path(device).name}/device"))
+    for parent in (folder, *folder.parents[:3]):
+        with contextlib.suppress(OSError):
+            return (parent / "serial").read_text().strip()
+    return ""
 
 
 def ports() -> list[str]:

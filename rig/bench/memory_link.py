@@ -27,6 +27,10 @@ class MemoryByteLink:
         except WireGone:
             raise DeviceLost(self.name, "the simulated port is gone") from None
 
+    def reopen(self) -> bool:
+        """Never: a wire in memory that comes back needs no opening."""
+        return False
+
     def close(self) -> None:
         """Nothing to release."""
 
@@ -50,6 +54,10 @@ class MemoryFrameLink:
             self._wire.host_write((frame.id, frame.data), self._clock.now())
         except WireGone:
             raise DeviceLost(self.name, "the simulated bus is gone") from None
+
+    def reopen(self) -> bool:
+        """Never: a wire in memory that comes back needs no opening."""
+        return False
 
     def close(self) -> None:
         """Nothing to release."""

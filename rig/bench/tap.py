@@ -34,6 +34,9 @@ class TappedByteLink:
         self._tap(self._role, "tx", data, self._when())
         self._link.write(data)
 
+    def reopen(self) -> bool:
+        return self._link.reopen()
+
     def close(self) -> None:
         self._link.close()
 
@@ -57,6 +60,9 @@ class TappedFrameLink:
     def write(self, frame: CanFrame) -> None:
         self._tap(self._role, "tx", frame.id.to_bytes(2, "big") + frame.data, self._when())
         self._link.write(frame)
+
+    def reopen(self) -> bool:
+        return self._link.reopen()
 
     def close(self) -> None:
         self._link.close()

@@ -7,7 +7,6 @@ gives lines ``engine PID``, ``guard PID`` and ``ended PID STATUS``. POSIX only.
 
 from __future__ import annotations
 
-import importlib
 import json
 import multiprocessing
 import os
@@ -24,7 +23,7 @@ from drivers.links.link import DeviceError
 from rig.base.errors import RigError
 from rig.protocol.experiment import Experiment, prepare
 from rig.run.run import Consent, run
-from rig.safety import remote
+from rig.safety import process, remote, start
 
 CONSENT = Consent("a benchmark", "a benchmark")
 
@@ -33,11 +32,11 @@ def main(scene: str, protocol: str) -> None:
     experiment = prepare(Path(scene), Path(protocol))
     # The product starts a guard's process afresh each time; here they are forked from one that has read the modules.
     multiprocessing.set_forkserver_preload(
-        ["rig.safety.process", "can", "drivers.links.can_link", "drivers.instruments.iseg_edcp"]
+        ["rig.safety.process", "serial", "drivers.links.can_link", "drivers.instruments.iseg_edcp"]
     )
     forkserver.ensure_running()
-    importlib.import_module("can")  # the engine reads it while it starts the guard
-    remote.get_context = lambda method: multiprocessing.get_context("forkserver")  # type: ignore[assignment, attr-defined]
+    fork = multiprocessing.get_context("forkserver").Process
+    start.start_guard = lambda end: start.ByMultiprocessing(fork(target=process.serve, args=(end,)))
     say("ready")
     serve(experiment)
 

@@ -134,13 +134,42 @@ class Stand:
                 pass
         if power_cycle:
             self.bench.power_cycle()
+        if self.do(lambda bench: bench.wire("hv").gone):
+            self.plug_in("hv")
         run = Run(self, self.folder / f"run-{len(self._runs)}.mcap")
         assert self._server.stdin is not None
-        self._server.stdin.write(json.dumps({"ports": dict(self.bench.ports), "log": str(run.log)}).encode() + b"\n")
+        self._server.stdin.write(json.dumps({"ports": self.ports(), "log": str(run.log)}).encode() + b"\n")
         self._server.stdin.flush()
         self._runs.append(run)
         self.wait(lambda: run.engine > 0, "an engine")
         return run
+
+    def ports(self) -> dict[str, dict[str, str]]:
+        """Ports by role, under names that stay the same when a port comes back as another pseudo-terminal."""
+        named: dict[str, dict[str, str]] = {}
+        for role, keys in self.bench.ports.items():
+            key = "can_channel" if "can_channel" in keys else "port"
+            name = self.folder / f"tty-{role}"
+            if name.is_symlink() and str(name.readlink()) != keys[key]:
+                name.unlink()
+            if not name.is_symlink():
+                name.symlink_to(keys[key])
+            named[role] = {**keys, key: str(name)}
+        return named
+
+    def pull(self, role: str) -> float:
+        """Pull a port; gives back when."""
+        at = self.bench.clock.now()
+        self.do(lambda bench: bench.wire(role).cut())
+        return at
+
+    def plug_in(self, role: str) -> float:
+        """Put a port that was pulled back, under its name; gives back when it was there."""
+        before = self.bench.ports[role]
+        self.do(lambda bench: bench.wire(role).restore())
+        self.wait(lambda: self.bench.ports[role] != before, "the port", PATIENCE_S)
+        self.ports()
+        return self.bench.clock.now()
 
     def kill(self, pid: int, number: signal.Signals = signal.SIGKILL) -> float:
         """Send a signal to an engine or guard of ours; gives back when."""
@@ -221,8 +250,9 @@ class Stand:
 
     def __exit__(self, *error: object) -> None:
         for run in self._runs:
-            for pid in (run.engine, run.guard):
-                if pid > 0 and run.status is None:
+            # A guard whose supply never went off goes on trying.
+            for pid in [run.guard] * _lives(run.guard) + [run.engine] * (run.status is None):
+                if pid > 0:
                     with suppress(ProcessLookupError):
                         os.kill(pid, signal.SIGKILL)
         if self._server is not None:

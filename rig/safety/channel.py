@@ -48,9 +48,9 @@ class Channel:
             self._outbox += _pack(message)
         self.flush()
 
-    def hand_over(self, message: Message, handle: int) -> None:
-        """Send a message with a file descriptor, before there is other traffic. POSIX only."""
-        socket.send_fds(self._socket, [_pack(message)], [handle])
+    def hand_over(self, message: Message, *handles: int) -> None:
+        """Send a message with file descriptors, before there is other traffic. POSIX only."""
+        socket.send_fds(self._socket, [_pack(message)], handles)
 
     def flush(self) -> None:
         """Send what there is room for."""

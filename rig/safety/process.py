@@ -1,10 +1,11 @@
 """The guard as a process of its own: sole owner of the high-voltage link, and the last one to leave.
 
-The engine starts it when a scene with high voltage runs on real ports. It opens the link, holds the limits and the
-film's model itself, and runs its own loop. It executes set-points only while the engine's heartbeats arrive. The
-engine's death closes the socket between them: the output is then taken off at once. A hung engine misses its deadline:
-the same. Off is believed when it has been *measured*; a supply that does not obey is called NOT SAFE, told again for
-`TRY_S`, and left to the operator.
+The engine starts it when a scene with high voltage runs on real ports. It is handed the link (or opens it, where a link
+cannot be handed over), holds the limits and the film's model itself, and runs its own loop. It executes set-points only
+while the engine's heartbeats arrive. The engine's death closes the socket between them: the output is then taken off at
+once. A hung engine misses its deadline: the same. Off is believed when it has been *measured*; a supply that does not
+obey is called NOT SAFE and told again until it obeys. A port that vanished is opened again as soon as it is back.
+Nothing on this way needs a lock, a file or anybody's consent.
 
 Ctrl-C, SIGTERM and SIGHUP do not concern this process: its life is bound to the socket. When *both* processes are
 killed, or the computer loses its power, nothing in software is left to act, and the supply keeps its voltage: that case
@@ -18,6 +19,7 @@ import os
 import select
 import signal
 import socket
+import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -26,7 +28,7 @@ from typing import Literal
 
 import click
 
-from drivers.links.link import DeviceError
+from drivers.links.link import DeviceError, DeviceLost
 from drivers.roles import HVSample, HVSupply
 from drivers.settings import SupplySettings
 from rig.base.clock import RealClock
@@ -45,7 +47,9 @@ SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005
 STATE_S = 0.05  # how often the engine hears from us at least
 AGAIN_S = 0.1  # a command that failed is given again at this interval
 INSIST_S = 1.0  # an off that was sent but is not measured is sent again at this interval
-TRY_S = 20.0  # how long a supply that does not obey is told again after the engine has gone
+BEGIN_S = 30.0  # how long the engine may take to say what is to be guarded
+TRY_S = 3600.0  # how long a supply that does not obey is told again after the engine has gone, unless a signal ends it
+ENDING = ("SIGINT", "SIGTERM")  # signals that the guard obeys once its engine has gone and it has said NOT SAFE
 SPEAK_S = 1.0  # how long the last word may wait for a terminal that takes nothing
 STDERR = 2
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
@@ -68,23 +72,26 @@ def config(scene: Scene, clock: RealClock) -> bytes:
     return json.dumps(content).encode()
 
 
-def serve(end: socket.socket, configured: bytes) -> None:
-    """The life of the guard process, from opening the link to its end.
+def serve(end: socket.socket) -> None:
+    """The life of the guard process, from the engine's first message to its end.
 
     Parameters
     ----------
     end : socket
-        Our end of the pair; the engine holds the other one, and nobody else.
-    configured : bytes
-        From `config`.
+        Our end of the pair; the engine holds the other one, and nobody else. The first message has the configuration
+        (`config`), and with it come the descriptors of the link, if it can be handed over.
     """
     _detach()
-    known = json.loads(configured)
     channel = Channel(end)
+    begin = _first_message(channel)
+    if begin is None:
+        return
+    known = json.loads(begin["config"])
     scene = Scene.model_validate(known["scene"])
     assert scene.hv is not None
+    adopted, channel.handles = tuple(channel.handles), []
     try:
-        link = scene.hv.open(ROLE)
+        link = scene.hv.open(ROLE, adopted)
     except Exception as error:
         channel.send({"is": "error", "error": pack_error(error)})
         return
@@ -98,13 +105,23 @@ def serve(end: socket.socket, configured: bytes) -> None:
         channel.close()
 
 
+def _first_message(channel: Channel) -> Message | None:
+    clock = RealClock()
+    while clock.now() < BEGIN_S and not channel.closed:
+        select.select([channel], [], [], 0.5)
+        for message in channel.receive():
+            return message
+    return None
+
+
 def _detach() -> None:
     """Out of reach of the terminal: what is typed there, and its end, are the engine's business."""
     for name in IGNORED:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     if os.name == "posix":
-        os.setsid()
+        with suppress(OSError):  # it has a session of its own already
+            os.setsid()
         signal.pthread_sigmask(signal.SIG_SETMASK, ())
 
 
@@ -128,6 +145,7 @@ class Server:
         self._off_at: float | None = None  # when the output was taken off that is not measured off yet
         self._off_limit = 0.0  # ... after which time it must be measured off
         self._off_ramps = False  # ... and whether that was an orderly ramp
+        self._lost_at: float | None = None  # since when the link has been gone
         self._voice = Voice()
         self._told_not_safe = False
         self._dismissed = False
@@ -147,8 +165,9 @@ class Server:
 
     def close(self) -> None:
         """Let go of the log."""
-        if self._log is not None:
-            self._log.close()
+        log, self._log = self._log, None
+        if log is not None:
+            log.close()
 
     # The loop ------------------------------------------------------------------------------------------------
 
@@ -175,10 +194,24 @@ class Server:
 
     def _poll(self, guard: Guard, supply: HVSupply) -> None:
         self._polled_at = self._clock.now()  # all the time that the driver knows: what passes on its wire bears it
-        for raw in supply.poll(self._polled_at):
+        try:
+            samples = supply.poll(self._polled_at)
+        except DeviceLost:
+            self._find_again()
+            raise
+        for raw in samples:
             assert isinstance(raw, HVSample)
             self._tell_sample(raw)
             guard.on_sample(self._by_certificate(raw))
+
+    def _find_again(self) -> None:
+        """Open a link that was lost as soon as it is back; the off is sent at once then."""
+        now = self._clock.now()
+        if self._lost_at is None:
+            self._lost_at = now
+        if self._link.reopen():
+            self._tell_event("warning", f"the supply's link was gone for {now - self._lost_at:.2f} s and is open again")
+            self._lost_at, self._again = None, now
 
     def _by_certificate(self, sample: HVSample) -> HVSample:
         return replace(sample, voltage=sample.voltage * self._gain)
@@ -237,7 +270,7 @@ class Server:
             self._told_not_safe = True
             message = f"{NOT_SAFE} {ADVICE}"
             self._tell_event("error", message)
-            self._voice.say(f"dea-rig guard: {message}")
+            self._voice.say(f"dea-rig guard: {message} It is told again until it obeys (process {os.getpid()}).")
         elif now >= self._again:
             self._again = now + INSIST_S
             self._off(guard, guard.cause)
@@ -257,6 +290,7 @@ class Server:
                 self._log = RemoteLog(Path(message["path"]), socket.socket(fileno=self._channel.handles.pop(0)))
             case "close":
                 self._dismissed = True
+                self.close()  # the engine says in the log how it ended; what comes after is told at the terminal
             case other:
                 raise FaultError(f"hv: the engine asks the guard for {other!r}, which it does not know.")
 
@@ -361,7 +395,10 @@ class Server:
             cause = f"{cause}, after {guard.cause}"
         if not _measured_off(guard):
             self._off(guard, cause)
-        while not guard.output_is_safe and self._clock.now() - began < TRY_S:
+        ended_by: list[int] = []
+        while not guard.output_is_safe and self._clock.now() - began < TRY_S and not ended_by:
+            if self._told_not_safe:
+                _obey_signals(ended_by)
             try:
                 assert self._supply is not None
                 self._poll(guard, self._supply)
@@ -373,12 +410,20 @@ class Server:
         if guard.output_is_safe:
             message = f"{cause}. The high voltage is off, measured {measured:.0f} V."
         else:
-            message = f"{cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {ADVICE}"
+            message = f"{cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {ADVICE} The guard has ended."
         self._tell_event("error", message)
         self._voice.say(f"dea-rig guard: {message}")
         end = time.monotonic() + SPEAK_S
         while not self._voice.speak() and time.monotonic() < end:
             time.sleep(LONGEST_TURN_S)
+
+
+def _obey_signals(ended_by: list[int]) -> None:
+    """From now on the operator may end a guard that can do nothing more."""
+    for name in ENDING:
+        number = getattr(signal, name)
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda number, frame: ended_by.append(number))
 
 
 def _measured_off(guard: Guard) -> bool:
@@ -418,3 +463,7 @@ def pack_error(error: Exception) -> Message:
     kind = type(error).__name__ if isinstance(error, LimitError | FaultError) else "FaultError"
     text = str(error) if isinstance(error, LimitError | FaultError) else f"hv: internal error of the guard: {error!r}"
     return {"kind": kind, "text": text}
+
+
+if __name__ == "__main__":
+    serve(socket.socket(fileno=int(sys.argv[1])))

@@ -1,41 +1,43 @@
 """The guard's process as the engine sees it: both the supply that it polls and the `Guard` that it asks.
 
 Calls are answered within milliseconds and wait for the answer, so that what the guard refuses is refused here too.
-When the guard's process is lost (dead, silent or talking nonsense), nobody holds the link any more: the engine then
-opens it itself, takes the output off, and goes on to measure it.
+When the guard's process is lost (dead, silent or talking nonsense), the engine takes the output off itself and goes on
+to measure it. For that it keeps its own descriptor of the link, and driver and rules made ready, from the beginning:
+taking over needs no lock, no file, no new descriptor and nobody's consent, and off is sent again until it is measured.
 """
 
 from __future__ import annotations
 
 import math
 import select
-import signal
 import socket
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from multiprocessing import get_context
-from multiprocessing.util import Finalize
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, HVSupply, Identity, Sample
-from drivers.settings import CanSettings
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, LimitError, RigError, StaleData
 from rig.bench.devices import ROLE, Link, make_supply
 from rig.bench.tap import Tap
 from rig.log.recorder import Severity
-from rig.safety import process
+from rig.safety import process, start
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.scene.scene import Scene
 
-START_S = 30.0  # until the process must have opened the link; a slow disk has many modules to read
-ANSWER_S = 1.0  # a guard that takes longer to answer is lost
-SILENCE_S = 1.0  # ... and one that says nothing for this long: it sends its state twenty times a second
+START_S = 30.0  # until the process must have the link; a slow disk has many modules to read
+# A guard that says nothing for SILENCE_S is lost: it sends its state twenty times a second. One that was asked, and
+# works out what the film bears, gets ANSWER_S. Before any voltage a loaded computer may take longer.
+SILENCE_S, ANSWER_S = 0.2, 0.25
+UNARMED_S = 2.0
+LATE_S = 0.02  # a turn that took longer than this is the host's fault: nobody listened
 OPEN_AGAIN_S = 0.1
+GO_ON_S = 0.5  # how long to wait for the end of one that goes on trying, or hangs
 LEAVE_S = 5.0  # a guard that was told to go, and has nothing to take off, must have gone by then
 
 _ERRORS = {kind.__name__: kind for kind in (LimitError, FaultError, StaleData)}
@@ -78,36 +80,35 @@ class RemoteGuard:
         self._is_open = False
         self._heard_at = clock.now()
         self._lost = ""  # why the process is lost
-        self._successor: tuple[HVSupply, Guard] | None = None
-        self._next_open = -math.inf
-        self._link: Link | None = None
-        if isinstance(self._table, CanSettings):
-            import can  # noqa: F401  # so that it need not be read from disk when the guard has been lost
-        self._start()
+        self._listened_at = clock.now()
+        self._successor: tuple[HVSupply, Guard] | None = None  # made ready; in charge once the guard is lost
+        self._next_again = -math.inf
+        self._lost_at: float | None = None  # since when our own link has been gone
+        self._link: Link | None = self._table.open(ROLE) if self._table.two_may_hold else None
+        try:
+            self._start()
+        except BaseException:
+            if self._link is not None:
+                self._link.close()
+            raise
 
     def _start(self) -> None:
         ours, theirs = socket.socketpair()
         self._channel = Channel(ours)
-        # Before multiprocessing waits for its children at exit: a guard ends when its engine has gone.
-        self._at_exit = Finalize(self, self._channel.close, exitpriority=100)
-        self._process = get_context("spawn").Process(
-            target=process.serve, args=(theirs, process.config(self._scene, self._clock)), name="dea-rig guard"
-        )
-        blocked = None
-        if hasattr(signal, "pthread_sigmask"):  # until it ignores them, signals from the terminal must not reach it
-            numbers = [getattr(signal, name) for name in process.IGNORED]
-            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
         try:
-            self._process.start()
+            self._process = start.start_guard(theirs)
         finally:
-            if blocked is not None:
-                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
             theirs.close()
+        begin = {"do": "begin", "config": process.config(self._scene, self._clock).decode()}
+        descriptors = tuple(getattr(self._link, "descriptors", ()))
+        if descriptors:
+            self._channel.hand_over(begin, *descriptors)
+        else:
+            self._channel.send(begin)
 
     @property
     def pid(self) -> int:
         """Number of the guard's process."""
-        assert self._process.pid is not None
         return self._process.pid
 
     def opened(self) -> None:
@@ -159,6 +160,8 @@ class RemoteGuard:
             ``event(severity, message)`` for what the guard has to say itself.
         """
         self._tell, self._event = tell, event
+        if self._link is not None:
+            self._make_ready(self._link)
         self._channel.send({"do": "appoint", "gain": gain, "fresh": dict(fresh)})
         self._heard_at = self._clock.now()  # it has had nothing to say until now
 
@@ -175,9 +178,13 @@ class RemoteGuard:
         if self._lost:
             return self._poll_ourselves(now)
         self.next_poll = now + process.LONGEST_TURN_S
+        late = now - self._listened_at - LATE_S
+        if late > 0:
+            self._heard_at = min(self._heard_at + late, now)
+        self._listened_at = now
         self._listen()
-        if not self._lost and now - self._heard_at > SILENCE_S:
-            self._lose(f"it has said nothing for {now - self._heard_at:.1f} s")
+        if not self._lost and now - self._heard_at > (SILENCE_S if self.commanded else UNARMED_S):
+            self._lose(f"it has said nothing for {now - self._heard_at:.2f} s")
         if self._lost:
             raise self._loss()
         if self._errors:
@@ -186,16 +193,18 @@ class RemoteGuard:
         return samples
 
     def close(self) -> None:
-        """Let the process end, and see that it does. Calling it twice does no harm."""
+        """Tell the process to end, and see that it does. Calling it twice does no harm.
+
+        One that has commanded an output which is not measured off is left to go on trying.
+        """
+        may_go_on = self.commanded and not self.output_is_safe and not self._lost
         if not self._channel.closed:
             self._channel.send({"do": "close"})
-            # One that has commanded the output first sees that it is measured off, for as long as it may try.
-            self._process.join(LEAVE_S + (process.TRY_S if self.commanded else 0.0))
+            self._process.wait(GO_ON_S if may_go_on else LEAVE_S)
             self._channel.close()
-        self._process.join(LEAVE_S)
-        if self._process.is_alive():  # it hangs; nothing may wait for it
+        if not may_go_on and not self._process.wait(GO_ON_S if self._lost else LEAVE_S):  # nothing may wait for it
             self._process.kill()
-            self._process.join(LEAVE_S)
+            self._process.wait(GO_ON_S)
         if self._link is not None:
             self._link.close()
             self._link = None
@@ -241,7 +250,7 @@ class RemoteGuard:
     def on_sample(self, sample: HVSample) -> None:
         """The guard has judged it already."""
         self.last = sample
-        if self._successor is not None:
+        if self._lost and self._successor is not None:
             guard = self._successor[1]
             guard.on_sample(sample)
             self._mirror(guard)
@@ -249,7 +258,7 @@ class RemoteGuard:
     # The process ---------------------------------------------------------------------------------------------
 
     def _call(self, name: str, *arguments: Any) -> None:
-        if self._successor is not None:
+        if self._lost and self._successor is not None:
             guard = self._successor[1]
             getattr(guard, name)(*arguments)
             self._mirror(guard)
@@ -258,11 +267,12 @@ class RemoteGuard:
             self._calls += 1
             number = self._calls
             self._channel.send({"do": "call", "n": number, "name": name, "args": list(arguments)})
-            end = self._clock.now() + ANSWER_S
+            patience = ANSWER_S if self.commanded and name != "arm" else UNARMED_S
+            end = self._clock.now() + patience
             while number not in self._answers and not self._lost:
                 left = end - self._clock.now()
                 if left <= 0:
-                    self._lose(f"it did not answer within {ANSWER_S:g} s")
+                    self._lose(f"it did not answer within {patience:g} s")
                     break
                 if not self._channel.closed:
                     select.select([self._channel], [], [], left)
@@ -307,7 +317,7 @@ class RemoteGuard:
                 self._errors.append(unpack_error(message["error"]))
             case "opened":
                 self._is_open = True
-                self.link_settings = message["settings"]
+                self.link_settings = message["settings"] | getattr(self._link, "settings", {})
 
     def _take_state(self, message: Message) -> None:
         self.state = GuardState(message["state"])
@@ -324,63 +334,94 @@ class RemoteGuard:
     # When it is lost -----------------------------------------------------------------------------------------
 
     def _lose(self, why: str) -> None:
-        """The process is lost. What is left of it must not hold the link, nor wake up again."""
+        """The process is lost: what is left of it must not wake up again. We take the output off ourselves."""
         if self._lost:
             return
         self._lost = why
         self.state, self.cause, self.output_is_safe = GuardState.SAFE, f"the guard is lost: {why}", False
         self._channel.close()
-        self._process.kill()
-        self._process.join(LEAVE_S)
-        self._take_over()
+        self._process.kill()  # and nobody waits: one that hangs in the system may never end
+        if self._is_open:
+            self._take_over()
 
     def _loss(self) -> FaultError:
         done = "the output was never commanded"
         if self.commanded:
-            done = "the output was commanded off" if self._successor else "the link cannot be opened"
+            done = "the output was commanded off" if self._lost_at is None else "the link is gone"
         return FaultError(f"hv: the guard is lost ({self._lost}); from here {done}.")
 
+    def _make_ready(self, link: Link) -> None:
+        """Driver and rules that take over; they send nothing before."""
+        supply = make_supply(self._table, link, self._tap, self._clock.now)
+        limits = Limits.of(self._scene)
+        film = FilmLimits(self._scene.specimen.specimen(), limits)
+        self._successor = supply, Guard(supply, limits, film, self._table.ramp_V_per_s, self._tell_now)
+
     def _take_over(self) -> None:
-        """Open the link ourselves and command the output off, if it was ever commanded on."""
-        if not self._is_open:
-            return
-        self._next_open = self._clock.now() + OPEN_AGAIN_S
+        """Command the output off, if it was ever commanded on."""
+        now = self._clock.now()
         try:
-            self._link = self._table.open(ROLE)
-            supply = make_supply(self._table, self._link, self._tap, self._clock.now)
-            limits = Limits.of(self._scene)
-            film = FilmLimits(self._scene.specimen.specimen(), limits)
-            guard = Guard(supply, limits, film, self._table.ramp_V_per_s, self._tell_now)
-            guard.commanded = self.commanded
-            self._successor = supply, guard
+            if self._link is None:  # one that two programs cannot have open: free now
+                self._link = self._table.open(ROLE)
+                self._make_ready(self._link)
+            self._lost_at = None
+        except Exception as error:
+            self._lost_at, self._next_again = now, now + OPEN_AGAIN_S
+            self._errors.append(error)
+            return
+        assert self._successor is not None
+        self._successor[1].commanded = self.commanded
+        with suppress(DeviceLost):
+            getattr(self._link, "resume", lambda: None)()
+        self._off(now)
+
+    def _off(self, now: float) -> None:
+        """Send the off, at once and whatever else may fail, and measure."""
+        assert self._successor is not None
+        supply, guard = self._successor
+        self._next_again = now + process.INSIST_S
+        try:
             guard.kill(self.cause)
-            self._samples += supply.poll(self._clock.now())  # so that the command is sent at once
+            self._samples += supply.poll(now)
+        except DeviceLost as error:
+            self._find_again(now)
+            self._errors.append(error)
         except Exception as error:
             self._errors.append(error)
-        self._mirror_successor()
+        self._mirror(guard)
+
+    def _find_again(self, now: float) -> None:
+        """Open a link that was lost as soon as it is back; the off is sent at the next turn then."""
+        if self._lost_at is None:
+            self._lost_at = now
+        if self._link is not None and self._link.reopen():
+            gone = now - self._lost_at
+            self._event("warning", f"the supply's link was gone for {gone:.2f} s and is open again")
+            self._lost_at, self._next_again = None, now
 
     def _tell_now(self, command: str, argument: str) -> None:
         self._tell(command, argument, self._clock.now())
 
     def _poll_ourselves(self, now: float) -> Sequence[Sample]:
+        """In the guard's place: measure, and send the off again while it is not measured."""
         if self._errors:
             raise self._errors.popleft()
-        if self._successor is None:
-            if now < self._next_open:
-                return []
-            self._take_over()
-            if self._errors:
-                raise self._errors.popleft()
+        if self._link is None or self._successor is None:
+            if self._is_open and now >= self._next_again:
+                self._take_over()
             return []
-        supply = self._successor[0]
-        samples = [*self._samples, *supply.poll(now)]
-        self._samples = []
-        self.ready, self.counters, self.next_poll = supply.ready, supply.counters, supply.next_poll
+        supply, guard = self._successor
+        if guard.commanded and not guard.output_is_safe and now >= self._next_again:
+            self._off(now)
+        try:
+            samples = [*self._samples, *supply.poll(now)]
+        except DeviceLost:
+            self._find_again(now)
+            raise
+        finally:
+            self._samples = []
+            self.ready, self.counters, self.next_poll = supply.ready, supply.counters, supply.next_poll
         return samples
-
-    def _mirror_successor(self) -> None:
-        if self._successor is not None:
-            self._mirror(self._successor[1])
 
     def _mirror(self, guard: Guard) -> None:
         self.state, self.cause, self.commanded = guard.state, guard.cause, guard.commanded

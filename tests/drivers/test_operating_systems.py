@@ -63,9 +63,9 @@ def posix_only(path: Path) -> bool:
 def test_drivers_ask_for_the_system_in_one_place() -> None:
     found = {path.name: list(used(path)) for path in sorted((ROOT / "drivers").rglob("*.py"))}
     places = {name: names for name, names in found.items() if names}
-    assert set(places) == {"serial_link.py"}
-    assert all(guarded for _, guarded in places["serial_link.py"])
-    assert {"fcntl", "termios"} <= {name for name, _ in places["serial_link.py"]}  # it does find them
+    assert set(places) == {"system.py"}
+    assert all(guarded for _, guarded in places["system.py"])
+    assert {"fcntl", "termios"} <= {name for name, _ in places["system.py"]}  # it does find them
 
 
 def test_nothing_else_needs_posix_without_asking_or_saying_so() -> None:
@@ -150,12 +150,14 @@ def windows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(serial, "Serial", Port)
     monkeypatch.setattr(serial.tools.list_ports, "comports", list)
-    spec = importlib.util.spec_from_file_location(
-        "serial_link_on_windows", ROOT / "drivers" / "links" / "serial_link.py"
-    )
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    for name in ("system", "port_lock", "serial_link"):
+        full = f"drivers.links.{name}"
+        spec = importlib.util.spec_from_file_location(full, ROOT / "drivers" / "links" / f"{name}.py")
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, full, module)
+        spec.loader.exec_module(module)
     return module
 
 
@@ -163,23 +165,32 @@ def test_on_windows_a_port_is_read_written_and_locked(windows: ModuleType) -> No
     link = windows.SerialLink("stage", "COM3", 115_200)
     assert link.settings["low_latency"].startswith("not available")
     link.write(b"/1 get pos\n")
-    assert link.read() == b"abc" and link._serial.sent == b"/1 get pos\n"
+    assert link.read() == b"abc" and link._port._serial.sent == b"/1 get pos\n"
     assert sys.modules["msvcrt"].at == [4096]  # beyond the text, which others may read
     with pytest.raises(DeviceError, match=f"com3 is in use by process {os.getpid()}"):
         windows.SerialLink("other", "com3", 115_200)  # names of ports know no case
-    link._serial.takes = 2
+    device = link._port._serial
+    device.takes = 2
+    now = [0.0]
+    link._clock = lambda: now[0]
+    link.write(b"/1 get pos\n")  # the rest goes out later
+    link.read()
+    assert device.sent.endswith(b"/1 g")
+    device.takes = 0
+    link.read()
+    now[0] += 1.0
     with pytest.raises(DeviceLost, match="takes no more data"):
-        link.write(b"/1 get pos\n")
+        link.read()
     link.close()
     link.close()
-    assert link._serial.closed
+    assert device.closed
     with pytest.raises(DeviceLost, match="gone"):
         link.read()
 
 
 def test_on_windows_a_port_that_goes_is_one_error(windows: ModuleType) -> None:
     link = windows.SerialLink("stage", "COM4", 115_200)
-    link._serial.gone = True
+    link._port._serial.gone = True
     for act in (link.read, lambda: link.write(b"x"), link.fileno):
         with pytest.raises(DeviceLost, match="gone"):
             act()

@@ -18,7 +18,7 @@ from rig.safety import process
 from rig.safety.channel import Channel
 from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
 from rig.safety.heartbeat import Heartbeat
-from rig.safety.process import TRY_S, Server, Voice
+from rig.safety.process import Server, Voice
 from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.truth import Fault
@@ -219,11 +219,30 @@ def test_a_guard_does_not_leave_an_output_that_is_not_measured_off(alone: Alone,
     assert alone.output < SAFE_VOLTAGE
 
 
-def test_a_guard_leaves_a_supply_that_does_not_obey_in_the_end(alone: Alone) -> None:
+def test_a_guard_leaves_a_supply_that_does_not_obey_in_the_end(alone: Alone, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "TRY_S", 20.0)
     supply: Any = alone.truth.instruments["hv"]
     supply.stuck_on = True
-    assert TRY_S <= alone.leave() < TRY_S + 1.0
+    assert 20.0 <= alone.leave() < 21.0
     assert alone.output > 990
+
+
+def test_a_guard_goes_on_for_minutes_and_takes_a_supply_off_that_obeys_late(
+    alone: Alone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    supply: Any = alone.truth.instruments["hv"]
+    supply.stuck_on = True
+    began = alone.clock.now()
+    sleep = alone.clock.sleep_until
+
+    def sleep_until(t: float) -> None:
+        sleep(t)
+        if alone.clock.now() > began + 100.0:
+            supply.stuck_on = False
+
+    monkeypatch.setattr(alone.clock, "sleep_until", sleep_until)
+    assert 99.0 < alone.leave() < 103.0
+    assert alone.output < SAFE_VOLTAGE
 
 
 def test_a_guard_that_has_measured_off_leaves_at_once(alone: Alone) -> None:

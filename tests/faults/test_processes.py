@@ -9,10 +9,12 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from rig.base.errors import RigError
 from rig.benchmark.stand import Run, Stand
 from rig.log.reader import read_log
 from rig.safety.guard import AT_ONCE_S
@@ -22,6 +24,8 @@ from rig.sim.truth import Fault
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
 
+TRIES = 3
+BACK_S = 2.0  # twice what is required
 KILLED_S, HUNG_S = 0.5, 1.5  # ten times and seven times what is required
 
 
@@ -33,7 +37,13 @@ def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
 
 @pytest.fixture
 def live(stand: Stand) -> Run:
-    """A run with voltage on, in its hold."""
+    """A run with voltage on, in its hold. On a machine too busy a run is rightly given up before: then another."""
+    for _ in range(TRIES - 1):
+        run = stand.start()
+        with suppress(RigError):
+            stand.wait_until_live(run, 780.0)
+            return run
+        stand.wait_until_alone(run)
     run = stand.start()
     stand.wait_until_live(run, 780.0)
     return run
@@ -154,13 +164,13 @@ def test_guard_killed(stand: Stand, live: Run) -> None:
     assert commands(live)[-1] == "emergency_off"
 
 
-@pytest.mark.slow
 def test_guard_that_hangs_is_ended_and_replaced_by_the_engine(stand: Stand, live: Run) -> None:
+    """Required are 0.3 s; the reason names the guard, not a sensor that nobody asked any more."""
     at = stand.kill(live.guard, signal.SIGSTOP)
-    off_after(stand, at, 10 * HUNG_S)
+    off_after(stand, at, HUNG_S)
     stand.wait_until_alone(live)
     stays_off(stand, at)
-    assert live.status == 4 and "the guard is lost" in live.said
+    assert live.status == 4 and "the guard is lost (it has said nothing for 0.2" in live.said
     assert read_log(live.log).outcome["safe"] == "yes"  # type: ignore[index]
 
 
@@ -227,14 +237,55 @@ def test_a_guard_whose_engine_takes_leave_of_a_live_output_stays_and_tries_on(st
 
 @pytest.mark.slow
 def test_a_bus_that_is_pulled_with_voltage_on_ends_the_run_as_not_safe(stand: Stand, live: Run) -> None:
-    stand.do(lambda bench: bench.inject(Fault(role="hv", kind="vanish")))
-    stand.wait_until_alone(live)
+    at = stand.pull("hv")
+    stand.wait(lambda: live.status is not None, "the engine's end")
+    assert stand.bench.clock.now() - at < AT_ONCE_S + 5.0
     assert stand.bench.voltage() > 780.0  # no command can reach it
-    stand.do(lambda bench: bench.wire("hv").restore())
     assert live.status == 4
     outcome = read_log(live.log).outcome
     assert outcome is not None and outcome["safe"] == "NO" and outcome["stage_standing"] == "yes"
     assert "NOT SAFE" in "".join(m.fields["message"] for m in read_log(live.log).messages("/event"))
+    at = stand.plug_in("hv")  # the guard has gone on trying
+    off_after(stand, at, BACK_S)
+    stand.wait_until_alone(live)
+    stays_off(stand, at)
+    assert "The high voltage is off, measured" in live.said
+
+
+def test_an_adapter_that_is_pulled_and_comes_back_is_found_again_and_the_output_taken_off(
+    stand: Stand, live: Run
+) -> None:
+    """Required is 1 s."""
+    at = stand.pull("hv")
+    stand.wait(lambda: stand.bench.clock.now() > at + 0.3, "0.3 s")
+    at = stand.plug_in("hv")
+    off_after(stand, at, BACK_S)
+    stand.wait_until_alone(live)
+    stays_off(stand, at)
+    assert live.status == 4 and "is gone" in live.said
+    log = read_log(live.log)
+    assert log.outcome is not None and log.outcome["safe"] == "yes"
+    assert "is open again" in "".join(m.fields["message"] for m in log.messages("/event"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", ["guard killed", "pulled"])
+def test_a_guard_killed_while_the_adapter_is_out_leaves_the_engine_to_take_the_output_off(
+    stand: Stand, live: Run, first: str
+) -> None:
+    """No order of the two faults leaves it on once the adapter is back."""
+    if first == "pulled":
+        stand.pull("hv")
+    stand.kill(live.guard)
+    if first != "pulled":
+        stand.pull("hv")
+    now = stand.bench.clock.now()
+    stand.wait(lambda: stand.bench.clock.now() > now + 0.3, "0.3 s")
+    at = stand.plug_in("hv")
+    off_after(stand, at, BACK_S)
+    stand.wait_until_alone(live)
+    stays_off(stand, at)
+    assert live.status == 4
 
 
 @pytest.mark.slow

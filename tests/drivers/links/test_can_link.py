@@ -15,8 +15,9 @@ import can
 import pytest
 
 from drivers.instruments.iseg_edcp.device import IsegEDCP
-from drivers.links.can_link import INTERFACES, CanLink
+from drivers.links.can_link import INTERFACES, TAKES_S, CanLink, open_bus
 from drivers.links.link import CanFrame, DeviceError, DeviceLost, DeviceRefused, FrameLink
+from drivers.links.slcan_link import SlcanLink
 
 _channels = itertools.count()
 
@@ -111,9 +112,11 @@ def test_a_backend_that_fails_is_a_loss(pair: tuple[CanLink, can.BusABC]) -> Non
 
 def test_interface_and_channel_that_do_not_exist() -> None:
     with pytest.raises(DeviceRefused, match=r"no CAN interface 'usb'.*Allowed: socketcan, slcan"):
-        CanLink("hv", "usb", "0")
-    with pytest.raises(DeviceLost, match="cannot be opened"):
-        CanLink("hv", "slcan", "/dev/does-not-exist")
+        open_bus("hv", "usb", "0")
+    with pytest.raises(DeviceError, match=r"cannot be opened.*does not exist"):
+        open_bus("hv", "slcan", "/dev/does-not-exist")
+    with pytest.raises(DeviceError, match="cannot be opened at 123 bit/s"):
+        open_bus("hv", "slcan", "/dev/does-not-exist", 123)
     with pytest.raises(DeviceError):
         CanLink("hv", "socketcan", "can-does-not-exist")
 
@@ -133,7 +136,7 @@ CHANNELS = {
 def test_every_interface_opens_or_refuses_plainly(interface: str, channel: str | None) -> None:
     """Whatever drivers this machine has: a link that reads nothing and can be closed, or a message that says why."""
     try:
-        link = CanLink("hv", interface, CHANNELS[interface] if channel is None else channel)
+        link = open_bus("hv", interface, CHANNELS[interface] if channel is None else channel)
     except DeviceError as error:
         text = str(error)
         assert text.startswith(f"hv ({interface} ") and "cannot be" in text
@@ -146,7 +149,7 @@ def test_every_interface_opens_or_refuses_plainly(interface: str, channel: str |
             link.read()
 
 
-@pytest.mark.parametrize("interface", [i for i in INTERFACES if i != "virtual"])
+@pytest.mark.parametrize("interface", [i for i in INTERFACES if i not in ("virtual", "slcan")])
 def test_a_library_that_fails_in_its_own_way_is_an_error_of_the_family(
     interface: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,7 +213,7 @@ def eventually(look: Callable[[], bool]) -> None:
     raise AssertionError("nothing came")
 
 
-def collect(link: CanLink, n: int) -> list[CanFrame]:
+def collect(link: FrameLink, n: int) -> list[CanFrame]:
     frames: list[CanFrame] = []
 
     def look() -> bool:
@@ -342,13 +345,13 @@ def adapter() -> Iterator[Adapter]:
 
 
 @pytest.fixture
-def link(adapter: Adapter) -> Iterator[CanLink]:
-    it = CanLink("hv", "slcan", adapter.port, 125_000)
+def link(adapter: Adapter) -> Iterator[SlcanLink]:
+    it = SlcanLink("hv", adapter.port, 125_000)
     yield it
     it.close()
 
 
-def test_slcan_opens_at_the_bit_rate_and_carries_frames(adapter: Adapter, link: CanLink) -> None:
+def test_slcan_opens_at_the_bit_rate_and_carries_frames(adapter: Adapter, link: SlcanLink) -> None:
     eventually(lambda: b"O" in adapter.commands)
     assert b"S4" in adapter.commands
     adapter.on_frame = lambda f: [CanFrame(f.id - 1, f.data + b"\x01")]
@@ -358,7 +361,7 @@ def test_slcan_opens_at_the_bit_rate_and_carries_frames(adapter: Adapter, link: 
     assert link.counters["garbage"] == 0
 
 
-def test_slcan_acknowledgements_do_not_hold_frames_back(adapter: Adapter, link: CanLink) -> None:
+def test_slcan_acknowledgements_do_not_hold_frames_back(adapter: Adapter, link: SlcanLink) -> None:
     eventually(lambda: b"O" in adapter.commands)
     adapter.send(b"\r\rz\r\x07" + b"t20011A\r" + b"z\r" + b"t20011B\r")
     frames: list[CanFrame] = []
@@ -379,7 +382,7 @@ def test_slcan_survives_garbage(adapter: Adapter, link: CanLink, garbage: bytes)
     assert collect(link, 1) == [CanFrame(0x200, b"\x1a")]
 
 
-def test_slcan_that_vanishes_is_lost(adapter: Adapter, link: CanLink) -> None:
+def test_slcan_that_vanishes_is_lost(adapter: Adapter, link: SlcanLink) -> None:
     eventually(lambda: b"O" in adapter.commands)
     adapter.vanish()
 
@@ -390,12 +393,81 @@ def test_slcan_that_vanishes_is_lost(adapter: Adapter, link: CanLink) -> None:
     link.close()
 
 
-def test_slcan_is_opened_by_one_program_only(adapter: Adapter, link: CanLink) -> None:
+def test_slcan_is_opened_by_one_program_only(adapter: Adapter, link: SlcanLink) -> None:
     with pytest.raises(DeviceError, match="in use"):
-        CanLink("other", "slcan", adapter.port)
+        SlcanLink("other", adapter.port)
 
 
-def test_the_driver_over_slcan(adapter: Adapter, link: CanLink) -> None:
+def test_slcan_refusals_are_counted_and_a_report_of_bus_off_is_a_loss(adapter: Adapter, link: SlcanLink) -> None:
+    eventually(lambda: b"O" in adapter.commands)
+    adapter.send(b"\x07" + b"t20011A\r" + b"T000002001\x07\r" + b"t20011B1234\r")
+    assert collect(link, 2) == [CanFrame(0x200, b"\x1a"), CanFrame(0x200, b"\x1b")]  # the last with a time stamp
+    assert link.counters["refused"] == 2 and link.counters["foreign_frames"] == 1
+    adapter.send(b"sb256256\r")
+    with pytest.raises(DeviceLost, match="bus-off"):
+        eventually(lambda: bool(link.read()))
+
+
+def test_slcan_reads_in_bulk(adapter: Adapter, link: SlcanLink) -> None:
+    """A busy bus costs a few reads a turn, not one a byte; what one call may take is bounded."""
+    eventually(lambda: b"O" in adapter.commands)
+    link.read()
+    calls = []
+    read = link._port.read
+    link._port.read = lambda: calls.append(1) or read()  # type: ignore[method-assign, func-returns-value]
+    line = b"t20081122334455667788\r"
+    adapter.send(line * 150)  # 3300 bytes, less than a pseudo-terminal holds
+    assert len(collect(link, 150)) == 150
+    assert len(calls) < 30
+
+
+def test_a_frame_for_which_there_is_no_room_waits_and_goes_out_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    channel = f"test-{next(_channels)}"
+    other = can.Bus(interface="virtual", channel=channel)
+    link = CanLink("hv", "virtual", channel, clock=lambda: now[0])
+    assert link._bus is not None
+    send, full = link._bus.send, [True]
+
+    def refuse(message: can.Message, timeout: float | None = None) -> None:
+        assert timeout == 0
+        if full[0]:
+            raise can.CanOperationError("Failed to transmit: No buffer space available", 105)  # ENOBUFS
+        send(message)
+
+    monkeypatch.setattr(link._bus, "send", refuse)
+    off, ask = CanFrame(0x200, b"off"), CanFrame(0x201, b"ask")
+    link.write(off)
+    link.write(ask)
+    link.write(off)  # repeated: once is enough
+    assert other.recv(0) is None
+    full[0] = False
+    link.read()
+    assert [bytes(other.recv(0).data) for _ in range(2)] == [b"off", b"ask"] and other.recv(0) is None
+    full[0] = True
+    link.write(off)
+    now[0] += TAKES_S + 0.01
+    with pytest.raises(DeviceLost, match="cannot be sent"):
+        link.read()
+    link.close()
+    other.shutdown()
+
+
+def test_a_bus_that_comes_back_is_opened_again(pair: tuple[CanLink, can.BusABC]) -> None:
+    link, other = pair
+    now = [0.0]
+    link._clock = lambda: now[0]
+    link._next_look = 0.0
+    assert link._bus is not None
+    link._bus.shutdown()
+    with pytest.raises(DeviceLost):
+        link.read()
+    assert link.reopen() and not link.reopen()
+    other.send(message(0x200, b"back"))
+    assert link.read() == [CanFrame(0x200, b"back")]
+
+
+def test_the_driver_over_slcan(adapter: Adapter, link: SlcanLink) -> None:
     """Set-up of the HV driver through link, pty and adapter in real time."""
     values = {
         "1000": "7720",
