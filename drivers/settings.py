@@ -145,6 +145,7 @@ class StageSettings(InstrumentSettings):
         default=0.0,
         ge=0,
         description="Stage position (mm), short of the film, to which it goes fast and where the slow approach begins.",
+        json_schema_extra={"usual": [0, 300]},
     )
 
 
@@ -169,7 +170,9 @@ class SupplySettings(InstrumentSettings):
     whole_volts: ClassVar[bool] = False
 
     ramp_V_per_s: Positive = Field(
-        default=100.0, description="How fast the voltage is raised and lowered (V/s). Typical: 50 to 500."
+        default=100.0,
+        description="How fast the voltage is raised and lowered (V/s). Typical: 50 to 500.",
+        json_schema_extra={"usual": [1, 20000]},
     )
     parallel_capacitance_nF: NotNegative = Field(
         default=0.0, description="Capacitance of cable and output beside the film (nF); it takes charging current too."

@@ -28,22 +28,15 @@ that `dea-rig calibrate` wrote also holds its evidence: ``data_sha256`` of the l
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from dataclasses import dataclass
 from datetime import date
-from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 FORMAT = "dea-rig certificate 1"
-LARGEST_BYTES = 256 * 1024  # a certificate is a page; a larger file is a mistake or an attack on the parser
 
 Role = Literal["force", "displacement", "hv", "stage"]
-
-
-class CertificateError(ValueError):
-    """A certificate that cannot be used; the message names file, key and value, and what is allowed."""
 
 
 @dataclass(frozen=True)
@@ -127,71 +120,66 @@ class Certificate:
         return self.low <= quantity <= self.high
 
 
-def load_certificate(path: Path) -> Certificate:
-    """Read one certificate. Raises `CertificateError`."""
-    try:
-        with path.open("rb") as file:
-            raw = file.read(LARGEST_BYTES + 1)
-    except OSError as error:
-        raise CertificateError(f"{path}: cannot read the certificate: {error.strerror}") from error
-    return parse_certificate(raw, str(path))
-
-
-def parse_certificate(raw: bytes, name: str) -> Certificate:
-    """A certificate from its bytes, as found in a file or attached to a log. Raises `CertificateError`."""
-    if len(raw) > LARGEST_BYTES:
-        raise CertificateError(f"{name}: larger than {LARGEST_BYTES // 1024} kB; this is no certificate")
-    try:
-        table = tomllib.loads(raw.decode("utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise CertificateError(f"{name}: not a TOML file: {str(error) or 'nested too deeply'}") from error
-    if table.get("format") != FORMAT:
-        raise CertificateError(f"{name}: format is {table.get('format')!r}; this program reads {FORMAT!r}")
-    try:
-        return _FILE.validate_python(table).certificate(name, raw)
-    except ValidationError as error:
-        lines = []
-        for item in error.errors(include_url=False, include_context=False):
-            where = [str(part) for part in item["loc"] if part not in ("force", "displacement", "hv", "stage")]
-            value = "" if item["type"] in ("missing", "extra_forbidden") else f" (it is {item['input']!r})"
-            lines.append(f"{name}: {'.'.join(where) or 'certificate'}: {item['msg']}{value}")
-        raise CertificateError("\n".join(lines)) from error
+def _rising(ends: list[float]) -> list[float]:
+    if not ends[0] < ends[1]:
+        raise ValueError("the range must run from the lower to the higher end")
+    return ends
 
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Relative = Annotated[float, Field(ge=0, lt=1)]
-Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+Range = Annotated[list[float], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 Text = Annotated[str, Field(min_length=1, max_length=200)]
 
+GAIN_UNCERTAINTY = "Relative standard uncertainty of the gain (k = 1). Typical: 0.0005 to 0.01."
+RANGE = "Calibrated range, lower and higher end; nothing is measured beyond it."
 
-class _Line(BaseModel):
+
+class BudgetLine(BaseModel):
+    """One component of the gain's uncertainty; for people, it changes nothing."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
-    component: Text
-    type: Literal["A", "B"]
-    relative: NotNegative
-    note: Annotated[str, Field(max_length=200)] = ""
+    component: Text = Field(description="Name of the component of uncertainty.")
+    type: Literal["A", "B"] = Field(description="A: evaluated from repeated readings. B: from other knowledge (GUM).")
+    relative: NotNegative = Field(description="Its standard uncertainty over the gain (k = 1).")
+    note: Annotated[str, Field(max_length=200)] = Field(default="", description="Where it comes from.")
 
 
-class _File(BaseModel):
+class AnyFile(BaseModel):
+    """What every certificate file has."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
-    format: Literal["dea-rig certificate 1"]
-    instrument: Text
-    serial: Annotated[str, Field(max_length=64)]
-    valid_from: date
-    valid_until: date
-    method: Text | None = None
-    lag_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    lag_uncertainty_s: NotNegative = 0.0
-    data_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
-    findings: dict[str, float] = Field(default_factory=dict)
-    budget: list[_Line] = Field(default_factory=list, max_length=100)
-    standstill: list[dict[str, float | str]] = Field(default_factory=list, max_length=2000)
+    format: Literal["dea-rig certificate 1"] = Field(description="Which format the file has.")
+    instrument: Text = Field(description="Make and model of the instrument that was calibrated.")
+    serial: Annotated[str, Field(max_length=64)] = Field(
+        description='Serial number as the instrument states it; "" if it states none.'
+    )
+    valid_from: date = Field(description="First day on which the certificate is valid, without quotes: 2026-01-31.")
+    valid_until: date = Field(description="Last day on which it is valid; a later run notes it in its log.")
+    method: Text | None = Field(default=None, description="How the values were found, in words.")
+    lag_s: Annotated[float, Field(ge=-1, le=1)] = Field(
+        default=0.0,
+        description="By how much a sample's time stamp is later than what it shows (s). Typical: 0 to 0.02.",
+    )
+    lag_uncertainty_s: NotNegative = Field(default=0.0, description="Standard uncertainty of lag_s (s, k = 1).")
+    data_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = Field(
+        default=None, description="SHA-256 of the log that the values came from; `dea-rig calibrate` writes it."
+    )
+    findings: dict[str, float] = Field(
+        default_factory=dict, description="What the calibration found beside the gain; for people."
+    )
+    budget: list[BudgetLine] = Field(
+        default_factory=list, max_length=100, description="Components of the gain's uncertainty; for people."
+    )
+    standstill: list[dict[str, float | str]] = Field(
+        default_factory=list, max_length=2000, description="The calibration's readings, one by one; for people."
+    )
 
     @model_validator(mode="after")
-    def _in_order(self) -> _File:
+    def _in_order(self) -> AnyFile:
         if not self.valid_from <= self.valid_until:
             raise ValueError(f"valid_from {self.valid_from} comes after valid_until {self.valid_until}")
         return self
@@ -210,8 +198,6 @@ class _File(BaseModel):
     ) -> Certificate:
         """``gain`` is the gain itself, the unit of the reading, and its relative uncertainty."""
         low, high = ends
-        if not low < high:
-            raise CertificateError(f"{name}: the range must run from the lower to the higher end, it is {ends}")
         return Certificate(
             role=role,
             instrument=self.instrument,
@@ -235,19 +221,33 @@ class _File(BaseModel):
         )
 
 
-class _ForceFile(_File):
-    role: Literal["force"]
-    gain_N_per_mV_per_V: Positive | None = None
-    gain_N_per_N: Positive | None = None
-    gain_relative_uncertainty: Relative
-    zero_reading_mV_per_V: float | None = None
-    zero_reading_N: float | None = None
-    noise_N: Positive
-    zero_uncertainty_N: NotNegative
-    range_N: Range
+class ForceFile(AnyFile):
+    """Certificate of a load cell: force = gain * (reading - reading at zero)."""
+
+    role: Literal["force"] = Field(description="Which role of a scene the certificate is for.")
+    gain_N_per_mV_per_V: Positive | None = Field(
+        default=None, description="Force per reading of an amplifier (N per mV/V). Typical: rated force over 2 mV/V."
+    )
+    gain_N_per_N: Positive | None = Field(
+        default=None, description="Force per reading of a cell that states newtons itself. Typical: 0.98 to 1.02."
+    )
+    gain_relative_uncertainty: Relative = Field(description=GAIN_UNCERTAINTY)
+    zero_reading_mV_per_V: float | None = Field(
+        default=None,
+        description="Reading of the unloaded cell when it was calibrated (mV/V); the force limit holds against it.",
+    )
+    zero_reading_N: float | None = Field(
+        default=None,
+        description="The same of a cell that states newtons (N).",
+    )
+    noise_N: Positive = Field(description="Standard deviation of one sample (N). Typical: 0.0002 to 0.02.")
+    zero_uncertainty_N: NotNegative = Field(
+        description="Standard uncertainty of a zero taken before the run, drift until its end included (N)."
+    )
+    range_N: Range = Field(description=f"{RANGE} In N.")
 
     @model_validator(mode="after")
-    def _one_gain(self) -> _ForceFile:
+    def _one_gain(self) -> ForceFile:
         if (self.gain_N_per_mV_per_V is None) == (self.gain_N_per_N is None):
             raise ValueError("give either gain_N_per_mV_per_V or gain_N_per_N, as the sensor's readings are")
         if (self.zero_reading_N if self.gain_N_per_N is None else self.zero_reading_mV_per_V) is not None:
@@ -264,43 +264,49 @@ class _ForceFile(_File):
         )
 
 
-class _DisplacementFile(_File):
-    role: Literal["displacement"]
-    gain_m_per_m: Positive
-    gain_relative_uncertainty: Relative
-    noise_m: NotNegative
-    zero_uncertainty_m: NotNegative
-    range_m: Range
+class DisplacementFile(AnyFile):
+    """Certificate of a displacement sensor."""
+
+    role: Literal["displacement"] = Field(description="Which role of a scene the certificate is for.")
+    gain_m_per_m: Positive = Field(description="Displacement per metre that the sensor states. Typical: 0.99 to 1.01.")
+    gain_relative_uncertainty: Relative = Field(description=GAIN_UNCERTAINTY)
+    noise_m: NotNegative = Field(description="Standard deviation of one sample (m). Typical: 1e-7 to 1e-5.")
+    zero_uncertainty_m: NotNegative = Field(description="Standard uncertainty of a zero taken before the run (m).")
+    range_m: Range = Field(description=f"{RANGE} In m.")
 
     def certificate(self, name: str, raw: bytes) -> Certificate:
         gain = self.gain_m_per_m, "m", self.gain_relative_uncertainty
         return self._certificate("displacement", gain, self.noise_m, self.zero_uncertainty_m, self.range_m, name, raw)
 
 
-class _HVFile(_File):
-    role: Literal["hv"]
-    gain_V_per_V: Positive
-    gain_relative_uncertainty: Relative
-    noise_V: NotNegative
-    zero_uncertainty_V: NotNegative
-    range_V: Range
+class HVFile(AnyFile):
+    """Certificate of a supply's voltage monitor."""
+
+    role: Literal["hv"] = Field(description="Which role of a scene the certificate is for.")
+    gain_V_per_V: Positive = Field(description="Voltage per volt that the supply states. Typical: 0.99 to 1.01.")
+    gain_relative_uncertainty: Relative = Field(description=GAIN_UNCERTAINTY)
+    noise_V: NotNegative = Field(description="Standard deviation of one sample (V). Typical: 0.1 to 5.")
+    zero_uncertainty_V: NotNegative = Field(description="Standard uncertainty of the reading at 0 V (V).")
+    range_V: Range = Field(description=f"{RANGE} In V.")
 
     def certificate(self, name: str, raw: bytes) -> Certificate:
         gain = self.gain_V_per_V, "V", self.gain_relative_uncertainty
         return self._certificate("hv", gain, self.noise_V, self.zero_uncertainty_V, self.range_V, name, raw)
 
 
-class _StageFile(_File):
-    role: Literal["stage"]
-    compliance_m_per_N: NotNegative
-    compliance_uncertainty_m_per_N: NotNegative
-    range_N: Range
+class StageFile(AnyFile):
+    """Certificate of the rig's compliance: by how much the disk moves less than the stage."""
+
+    role: Literal["stage"] = Field(description="Which role of a scene the certificate is for.")
+    compliance_m_per_N: NotNegative = Field(
+        description="By how much the rig gives way to the force on the disk (m/N). Typical: 1e-6 to 5e-4."
+    )
+    compliance_uncertainty_m_per_N: NotNegative = Field(description="Its standard uncertainty (m/N, k = 1).")
+    range_N: Range = Field(description=f"{RANGE} In N.")
 
     def certificate(self, name: str, raw: bytes) -> Certificate:
         compliance = self.compliance_m_per_N, self.compliance_uncertainty_m_per_N
         return self._certificate("stage", (1.0, "m", 0.0), 0.0, 0.0, self.range_N, name, raw, compliance=compliance)
 
 
-_FILE: TypeAdapter[_ForceFile | _DisplacementFile | _HVFile | _StageFile] = TypeAdapter(
-    Annotated[_ForceFile | _DisplacementFile | _HVFile | _StageFile, Field(discriminator="role")]
-)
+CertificateFile = ForceFile | DisplacementFile | HVFile | StageFile

@@ -14,7 +14,7 @@ import numpy as np
 from calibration.film.curve import Curve, CurveError
 from calibration.film.identify import IdentificationError, compare, identify
 from calibration.film.result import Identification
-from calibration.sensors.certificate import Certificate, CertificateError
+from calibration.sensors.certificate import Certificate
 from calibration.sheet.sheet_tests import TestsError, TestsFit, fit_tests, load_test
 from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
@@ -102,7 +102,7 @@ def identify_logs(
             from calibration.film.posterior import posterior as sample
 
             identification = replace(identification, posterior=sample(curves, identification, progress=progress))
-    except (CurveError, IdentificationError, CertificateError) as error:
+    except (CurveError, IdentificationError) as error:
         raise DataError(f"{error}.") from None
     return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs), comparison)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +10,8 @@ from numpy.typing import NDArray
 
 from model.material.materials import Material
 from rig.base.errors import ConfigError
-from rig.base.toml_file import read_text
+from rig.base.json_text import parse_json
+from rig.base.text_file import read_text
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def read_fit(path: Path, believed: Material) -> FittedFilm:
         When the file is no result of `dea-rig fit -o`.
     """
     try:
-        fit = json.loads(read_text(path, "fit"))
+        fit = parse_json(read_text(path, "fit"), "a fit", str(path))
         names = tuple(str(name) for name in fit["parameters"])
         values = {name: float(fit["quantities"][name]["value"]) for name in names}
         covariance = np.array(fit["covariance"], dtype=float)

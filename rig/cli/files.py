@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,16 +28,18 @@ def read_ports(path: Path | None) -> dict[str, dict[str, Any]] | None:
     return ports
 
 
-def read_json(path: Path, kind: str) -> Any:
+def read_json(path: Path, kind: str, most: int = 256 * 1024) -> Any:
     """What is in a JSON file, or in standard input for ``-``."""
     from rig.base.errors import ConfigError
-    from rig.base.toml_file import read_text
+    from rig.base.json_text import parse_json
+    from rig.base.text_file import decode, read_text
 
-    text = sys.stdin.read() if str(path) == "-" else read_text(path, kind)
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not a JSON file of {kind}: {error}.") from None
+    if str(path) != "-":
+        return parse_json(read_text(path, kind, most), kind, str(path))
+    data = sys.stdin.buffer.read(most + 1)
+    if len(data) > most:
+        raise ConfigError(f"standard input: larger than {most // 1024} kB; this is not a file of {kind}.")
+    return parse_json(decode(data, "standard input", kind), kind, "standard input")
 
 
 def tell_written(*paths: Path | None) -> None:

@@ -9,6 +9,8 @@ import click
 
 from rig.cli.files import FILE_OR_STDIN, read_json
 
+MOST_BYTES = 16 * 1024 * 1024
+
 
 @click.command("solve")
 @click.argument("cases", type=FILE_OR_STDIN)
@@ -24,7 +26,7 @@ def command(cases: Path) -> None:
     from rig.base.errors import ConfigError
 
     try:
-        answers = solve_cases(read_json(cases, "cases"))
+        answers = solve_cases(read_json(cases, "cases", MOST_BYTES))
     except CaseError as error:
         raise ConfigError(f"{cases}: {error}.") from None
     click.echo(json.dumps(answers, indent=2))

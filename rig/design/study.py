@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, Self, get_args
 
@@ -14,8 +13,11 @@ from model.actuator.stroke import Criteria
 from model.material.materials import NAMED, Material
 from model.specimen import Specimen
 from rig.base.errors import ConfigError
+from rig.base.problems import kind_of_table
 from rig.base.table import Table
-from rig.base.toml_file import read_text, validate
+from rig.base.text_file import read_text
+from rig.base.toml_file import validate
+from rig.base.toml_text import parse_toml
 from rig.scene.specimen import MaterialTable
 
 Positive = Annotated[float, Field(gt=0)]
@@ -227,7 +229,7 @@ class OptimiseStudy(Table):
 
 
 Study = ProfilesStudy | MapStudy | BoundaryStudy | OptimiseStudy
-_KINDS: dict[str, type[Study]] = {
+KINDS: dict[str, type[Study]] = {
     "profiles": ProfilesStudy,
     "map": MapStudy,
     "boundary": BoundaryStudy,
@@ -243,16 +245,8 @@ def load_study(path: Path) -> Study:
     ConfigError
         Naming file, key, value and what is allowed.
     """
-    text = read_text(path, "study")
-    try:
-        raw = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}.") from None
-    kind = raw.get("study")
-    if not isinstance(kind, str) or kind not in _KINDS:
-        allowed = ", ".join(f'"{name}"' for name in _KINDS)
-        raise ConfigError(f"{path}: this study file cannot be used.\n  study = {kind!r}: allowed are {allowed}.")
-    study = validate(raw, _KINDS[kind], "study", str(path))
+    raw = parse_toml(read_text(path, "study"), "study", str(path))
+    study = validate(raw, kind_of_table(raw, "study", KINDS, "study", str(path)), "study", str(path))
     if isinstance(study, OptimiseStudy) and study.fit is not None:  # named as seen from the study's folder
         study = study.model_copy(update={"fit": str(path.parent / study.fit)})
     return study

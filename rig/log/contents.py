@@ -6,9 +6,11 @@ import re
 from typing import TYPE_CHECKING
 
 from drivers.roles import Identity
+from rig.base.certificates import parse_certificate
+from rig.base.errors import ConfigError
+from rig.base.text import printable
 from rig.log.errors import LogError
 from rig.log.reader import Log
-from rig.log.text import printable
 
 if TYPE_CHECKING:
     from calibration.sensors.certificate import Certificate
@@ -30,12 +32,10 @@ def certificates_in(log: Log) -> dict[str, Certificate]:
     found: dict[str, Certificate] = {}
     for name, attachment in log.attachments.items():
         if name.startswith("certificate."):
-            from calibration.sensors.certificate import CertificateError, parse_certificate
-
             try:
                 certificate = parse_certificate(attachment.data, f"{printable(name)} inside")
-            except CertificateError as error:
-                raise LogError(log.path, f"holds a certificate that cannot be used: {error}") from None
+            except ConfigError as error:
+                raise LogError(log.path, f"holds a certificate that cannot be used: {str(error).rstrip('.')}") from None
             found[certificate.role] = certificate
     return found
 

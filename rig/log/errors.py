@@ -1,4 +1,4 @@
-"""The one error of the log."""
+"""The errors of the log."""
 
 from __future__ import annotations
 
@@ -25,3 +25,9 @@ class LogError(RigError):
         self.path = path
         self.what = what
         self.advice = advice
+
+
+class UnusableFile(LogError):
+    """A file or option of the command line that cannot be used; nothing was read or written."""
+
+    exit_code = 2

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rig.log.dataset import Run, load_run
-from rig.log.errors import LogError
+from rig.log.errors import UnusableFile
 from rig.log.part_file import PartFile
 from rig.log.reader import Columns, Log, read_log
 
@@ -34,7 +34,7 @@ def export(path: Path, out: Path, topic: str | None = None) -> int:
         The log cannot be read, ``out`` exists, has another ending, or cannot be written.
     """
     if out.suffix not in FORMATS:
-        raise LogError(out, "has an ending that says no known format", f"Allowed: {' and '.join(FORMATS)}.")
+        raise UnusableFile(out, "has an ending that says no known format", f"Allowed: {' and '.join(FORMATS)}.")
     table = _run_table(load_run(path)) if topic is None else _topic_table(read_log(path), topic)
     rows = len(next(iter(table.values())))
     file = PartFile(out)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rig.base.text import printable
 from rig.log.reader import Log, read_log
 from rig.log.schema import ROLES
-from rig.log.text import printable
 
 MOST_LINES = 12
 

@@ -6,7 +6,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from rig.log.errors import LogError
+from rig.log.errors import LogError, UnusableFile
 
 
 class PartFile:
@@ -28,14 +28,16 @@ class PartFile:
                 advice = "Nothing is overwritten: name another file, or move this one away."
                 if existing == self.part:
                     advice = f"An interrupted run left it; save what it holds: dea-rig recover {existing} -o OUT.mcap"
-                raise LogError(existing, "exists already", advice)
+                raise UnusableFile(existing, "exists already", advice)
         try:
             self._fd: int | None = os.open(
                 self.part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644
             )
             _sync_directory(self.part.parent)
         except OSError as error:
-            raise LogError(path, f"cannot be made ({error.strerror})", "Name a directory you can write to.") from error
+            raise UnusableFile(
+                path, f"cannot be made ({error.strerror})", "Name a directory you can write to."
+            ) from error
 
     @property
     def is_open(self) -> bool:

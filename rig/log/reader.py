@@ -13,8 +13,9 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from rig.base.text import printable
 from rig.log import schema
-from rig.log.errors import LogError
+from rig.log.errors import LogError, UnusableFile
 from rig.log.scan import (
     MAX_TABLES,
     ChannelInfo,
@@ -28,7 +29,6 @@ from rig.log.scan import (
     messages,
     rows,
 )
-from rig.log.text import printable
 
 Columns = dict[str, NDArray[Any]]
 
@@ -202,7 +202,7 @@ def _read(source: Source, tables: dict[str, _Table]) -> Log:
             scan.damaged(record, str(why))
     if not tally.counts.keys() & schema.CHANNELS.keys():
         if "log" not in metadata:
-            raise LogError(source.path, "holds nothing that dea-rig wrote", "Name a log of dea-rig.")
+            raise UnusableFile(source.path, "holds nothing that dea-rig wrote", "Name a log of dea-rig.")
         tally.check_version()
     return Log(
         path=source.path,
@@ -338,7 +338,7 @@ def _by_topic(channels: dict[int, ChannelInfo], found: Messages) -> Iterator[tup
 
 def _check_topic(path: Path, topic: str) -> None:
     if topic not in schema.CHANNELS:
-        raise LogError(path, f"no log has a topic {topic}")
+        raise UnusableFile(path, f"no log has a topic {topic}")
 
 
 def _decode(path: Path, topic: str, payload: bytes) -> dict[str, Any]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from rig.base.text import printable
 from rig.log.container import ContainerWriter
 from rig.log.errors import LogError
 from rig.log.part_file import PartFile
 from rig.log.reader import Log, read_log
-from rig.log.text import printable
 
 COMPLETE, NOTHING, PARTIAL = 0, 1, 3
 

@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from rig.log.container import MAGIC
-from rig.log.errors import LogError
+from rig.log.errors import LogError, UnusableFile
 
 MAX_RECORD = 64 * 1024 * 1024
 MAX_CHUNK = 16 * 1024 * 1024
@@ -111,17 +111,17 @@ class Source:
         try:
             self._fd = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         except FileNotFoundError:
-            raise LogError(path, "there is no such file", "Check the name.") from None
+            raise UnusableFile(path, "there is no such file", "Check the name.") from None
         except OSError as error:
-            raise LogError(path, f"cannot be opened ({error.strerror})") from error
+            raise UnusableFile(path, f"cannot be opened ({error.strerror})") from error
         try:
             if not path.is_file():
-                raise LogError(path, "is not a file", "Name one log.")
+                raise UnusableFile(path, "is not a file", "Name one log.")
             self.size = os.fstat(self._fd).st_size
             if self.size == 0:
-                raise LogError(path, "is empty", "The run ended before anything was recorded.")
+                raise UnusableFile(path, "is empty", "The run ended before anything was recorded.")
             if self.at(0, len(MAGIC)) != MAGIC:
-                raise LogError(path, "is not a log: it does not begin like an MCAP file", "Name a .mcap file.")
+                raise UnusableFile(path, "is not a log: it does not begin like an MCAP file", "Name a .mcap file.")
         except LogError:
             self.close()
             raise

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from rig.log.errors import LogError
+from rig.log.errors import LogError, UnusableFile
 
 LEAST_FREE = 32 * 10**6  # bytes; with less left, a run ends while its log can still be finished
 WARN_FREE = 256 * 10**6
@@ -32,7 +32,7 @@ def check(path: Path, seconds: float, rates: Mapping[str, float]) -> None:
     try:
         room = free(path.parent)
     except OSError as error:
-        raise LogError(path, f"cannot be made ({error.strerror})", "Name a directory you can write to.") from error
+        raise UnusableFile(path, f"cannot be made ({error.strerror})", "Name a directory you can write to.") from error
     if not room >= size + LEAST_FREE:
         at = ", ".join(f"{role} {rate:g} Hz" for role, rate in rates.items())
         raise LogError(

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.sensors.certificate import Certificate, CertificateError, load_certificate
+from calibration.sensors.certificate import Certificate
+from rig.base.certificates import load_certificate
 from rig.base.errors import ConfigError, LimitError
 from rig.calibrate.steps import CALIBRATION
 from rig.log.recorder import Gains
@@ -69,8 +70,8 @@ def certificates_of(scene: Scene, folder: Path) -> dict[str, Certificate]:
             continue
         try:
             certificate = load_certificate(folder / table.certificate)
-        except CertificateError as error:
-            raise ConfigError(f"{role}.certificate: {error}.") from None
+        except ConfigError as error:
+            raise ConfigError(f"{role}.certificate: {error}") from None
         if certificate.role != role:
             raise ConfigError(
                 f"{role}.certificate = {table.certificate!r}: this certificate is for the role {certificate.role!r}."

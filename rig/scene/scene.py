@@ -29,36 +29,81 @@ from rig.sim.twins import of_role as twins_of_role
 class LimitsTable(Table):
     """What may never be exceeded, by command or by measurement."""
 
-    force_N: Positive
-    displacement_mm: Positive
-    speed_mm_per_s: Positive
-    voltage_V: Positive | None = None
-    current_uA: Positive | None = None
-    field_V_per_um: Positive | None = None
-    minimum_hoop_stress_kPa: float = 0.0
-    stored_energy_mJ: Positive = 350.0  # 0.5 C V^2; EN 50191 names this as the harmless discharge
-    leakage_uA: Positive = 2.0  # beside the current that charges the film; more in two samples running is a breakdown
+    force_N: Positive = Field(
+        description="Largest force on the load cell, either way (N). Typical: 0.5 to 20, below the cell's rated force.",
+        json_schema_extra={"usual": [0.005, 200]},
+    )
+    displacement_mm: Positive = Field(
+        description="Largest displacement of the disk out of the film's plane (mm). Typical: 5 to 50.",
+        json_schema_extra={"usual": [0.05, 200]},
+    )
+    speed_mm_per_s: Positive = Field(
+        description="Highest speed of the stage in contact with the film (mm/s). Typical: 1 to 20.",
+        json_schema_extra={"usual": [0.01, 500]},
+    )
+    voltage_V: Positive | None = Field(
+        default=None,
+        description="Highest voltage (V); needed with [hv]. Typical: 500 to 8000.",
+        json_schema_extra={"usual": [10, 30000]},
+    )
+    current_uA: Positive | None = Field(
+        default=None,
+        description="Highest current of the supply (uA); needed with a supply that measures it. Typical: 10 to 200.",
+        json_schema_extra={"usual": [0.1, 5000]},
+    )
+    field_V_per_um: Positive | None = Field(
+        default=None,
+        description="Highest true electric field, voltage over deformed thickness (V/um). Typical: 20 to 100.",
+        json_schema_extra={"usual": [0.1, 1000]},
+    )
+    minimum_hoop_stress_kPa: float = Field(
+        default=0.0,
+        description="Smallest hoop stress that must remain in the film (kPa); below 0: may wrinkle. Typical: 0 to 10.",
+        json_schema_extra={"usual": [-1000, 1000]},
+    )
+    stored_energy_mJ: Positive = Field(
+        default=350.0,
+        description="Largest stored energy, 0.5 C V^2 (mJ). 350 is the harmless discharge of EN 50191.",
+        json_schema_extra={"usual": [0.001, 350]},
+    )
+    leakage_uA: Positive = Field(
+        default=2.0,
+        description="Current beside what charges the film (uA); more in two samples running is a breakdown. "
+        "Typical: 0.5 to 10.",
+        json_schema_extra={"usual": [0.01, 500]},
+    )
 
 
 class BenchTable(Table):
     """A log in place of the instruments: it answers what it was asked when it was recorded, and nothing else."""
 
-    backend: Literal["replay"]
-    log: str = Field(min_length=1)
+    backend: Literal["replay"] = Field(description='"replay": a log answers in place of the instruments.')
+    log: str = Field(min_length=1, description="The log (.mcap), as seen from the scene's folder.")
 
 
 class Scene(Table):
     """Everything about the bench for one specimen. See the module's docstring."""
 
-    title: str = ""
-    specimen: SpecimenTable
-    limits: LimitsTable
-    stage: AnyStage
-    force: AnyForce
-    displacement: AnyDisplacement | None = None
-    hv: AnySupply | None = None
-    simulation: SimulationSettings | None = None
-    bench: BenchTable | None = None
+    title: str = Field(default="", max_length=200, description="What this bench is for, in words.")
+    accept: list[str] = Field(
+        default_factory=list,
+        max_length=50,
+        description='Keys whose unusual values are meant, by name: ["limits.force_N"].',
+    )
+    specimen: SpecimenTable = Field(description="The film as mounted.")
+    limits: LimitsTable = Field(description="What may never be exceeded.")
+    stage: AnyStage = Field(description="The linear stage that pushes the disk.")
+    force: AnyForce = Field(description="The load cell under or over the disk.")
+    displacement: AnyDisplacement | None = Field(
+        default=None, description="A displacement sensor at the disk. Absent: the stage's position counts."
+    )
+    hv: AnySupply | None = Field(
+        default=None, description="The high-voltage supply. Absent: no electrostatics, no permittivity."
+    )
+    simulation: SimulationSettings | None = Field(
+        default=None, description="The simulated bench: the truth behind film and instruments, and their faults."
+    )
+    bench: BenchTable | None = Field(default=None, description="A log in place of all instruments.")
 
     @model_validator(mode="before")
     @classmethod

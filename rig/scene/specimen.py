@@ -10,6 +10,7 @@ from drivers.settings import NotNegative, Positive
 from model.material.materials import NAMED, Material
 from model.specimen import Specimen
 from rig.base.table import Table
+from rig.base.unusual import slip_of
 
 
 class MaterialTable(Table):
@@ -46,27 +47,62 @@ class MaterialTable(Table):
 class SpecimenTable(Table):
     """The film as mounted. The material is what is believed of it: it plans and guards, the fit starts from it."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")
-    disk_radius_mm: Positive
-    ring_radius_mm: Positive
-    thickness_um: Positive
-    prestretch: float = Field(ge=1.0, le=6.0)
-    material: str | MaterialTable
-    # Standard uncertainties of the dimensions; at 0 the results are stated for the dimensions as given.
-    disk_radius_uncertainty_mm: NotNegative = 0.0
-    thickness_uncertainty_um: NotNegative = 0.0
-    prestretch_uncertainty: NotNegative = 0.0
-    eccentricity_mm: NotNegative = 0.0  # how far the disk may sit off the ring's centre
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9._-]{1,64}$",
+        description="Name of this one specimen, for logs and reports: 1 to 64 letters, digits, points, _ and -.",
+    )
+    disk_radius_mm: Positive = Field(
+        description="Radius of the rigid disk in the middle (mm). Typical: 2 to 15.",
+        json_schema_extra={"usual": [0.2, 100]},
+    )
+    ring_radius_mm: Positive = Field(
+        description="Inner radius of the ring that holds the film (mm). Typical: 10 to 60.",
+        json_schema_extra={"usual": [1, 300]},
+    )
+    thickness_um: Positive = Field(
+        description="Thickness of the film (um) before pre-stretch. Typical: 20 to 1000.",
+        json_schema_extra={"usual": [1, 5000]},
+    )
+    prestretch: float = Field(
+        ge=1.0,
+        le=6.0,
+        description="Equibiaxial pre-stretch, stretched over original length; 1 is none. Typical: 1.05 to 4.",
+        json_schema_extra={"usual": [1, 6]},
+    )
+    material: str | MaterialTable = Field(
+        description="What is believed of the film: the name of a known material, or a table [specimen.material]."
+    )
+    disk_radius_uncertainty_mm: NotNegative = Field(
+        default=0.0, description="Standard uncertainty of disk_radius_mm (mm, k = 1); at 0 it counts as exact."
+    )
+    thickness_uncertainty_um: NotNegative = Field(
+        default=0.0, description="Standard uncertainty of thickness_um (um, k = 1); at 0 it counts as exact."
+    )
+    prestretch_uncertainty: NotNegative = Field(
+        default=0.0, description="Standard uncertainty of prestretch (k = 1); at 0 it counts as exact."
+    )
+    eccentricity_mm: NotNegative = Field(
+        default=0.0, description="How far the disk may sit off the ring's centre (mm). Typical: 0 to 0.5."
+    )
 
     @model_validator(mode="after")
     def _sensible(self) -> Self:
         if not self.disk_radius_mm < self.ring_radius_mm:
-            raise ValueError("disk_radius_mm must be smaller than ring_radius_mm")
+            raise ValueError(self._disk_in_ring())
         if not self.eccentricity_mm < self.ring_radius_mm - self.disk_radius_mm:
             raise ValueError("eccentricity_mm must be smaller than the gap between disk and ring")
         if isinstance(self.material, str) and self.material not in NAMED:
             raise ValueError(f"material {self.material!r} is not known; known are {', '.join(sorted(NAMED))}")
         return self
+
+    def _disk_in_ring(self) -> str:
+        """What is wrong when the disk does not fit into the ring, and what was probably meant."""
+        lengths = {"disk_radius_mm": self.disk_radius_mm, "ring_radius_mm": self.ring_radius_mm}
+        hints = [hint for key, value in lengths.items() if (hint := slip_of(type(self), key, value))]
+        told = " and ".join(f"{key} = {value:g}" for key, value in lengths.items())
+        return f"{told}, but disk_radius_mm must be smaller than ring_radius_mm. " + (
+            " ".join(hints) or "Were the two swapped?"
+        )
 
     def specimen(self) -> Specimen:
         """The specimen in SI units."""

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from model.membrane.solve import profiles
 from rig.base.errors import ConfigError
+from rig.base.text import printable
 from rig.base.toml_file import parse_table
 from rig.log.dataset import Run
-from rig.log.text import printable
 from rig.scene.scene import Scene
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 
 from rig.base.clock import RealClock
 from rig.base.errors import ConfigError, RigError
+from rig.base.text import printable
 from rig.log.dataset import Run, load_run
-from rig.log.text import printable
 from rig.view.recording import TIMELINE, best_instant, write_recording
 
 if TYPE_CHECKING:

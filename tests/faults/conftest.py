@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.sensors.certificate import load_certificate
 from drivers.links.link import DeviceError
+from rig.base.certificates import load_certificate
 from rig.base.errors import RigError
 from rig.base.toml_file import parse_table
 from rig.engine.engine import Engine, Outcome

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.sensors.certificate import load_certificate
 from drivers.links.link import DeviceError
 from model.membrane.solve import solve_many
+from rig.base.certificates import load_certificate
 from rig.base.errors import ConfigError, RigError, Stopped
 from rig.engine.engine import Engine, Outcome
 from rig.log.dataset import Run, load_run

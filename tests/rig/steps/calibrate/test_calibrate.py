@@ -13,12 +13,12 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from calibration.film.propagation import secant_modulus
-from calibration.sensors.certificate import load_certificate
 from rig.analysis.certificate_file import certificate_text
 from rig.analysis.film import identify_logs
 from rig.analysis.proposal import MARGIN
 from rig.analysis.sensor_protocols import protocol_text
 from rig.analysis.sensors import Calibration, Lag, calibrate
+from rig.base.certificates import load_certificate
 from rig.base.errors import DataError, LimitError
 from rig.base.toml_file import load_table, parse_table
 from rig.calibrate.plan import series
