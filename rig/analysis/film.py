@@ -169,6 +169,10 @@ def _notes(runs: Sequence[Run]) -> list[str]:
 
 def _certificate_problems(run: Run) -> list[str]:
     """What the run itself noted against the certificates that it used: their dates, another serial number."""
+    problems = [message.fields["problem"] for message in run.log.messages("/certificate_problem")]
+    if "/identity" in run.log.topics:
+        return list(dict.fromkeys(problems))
+    # Older logs say it in sentences.
     noted = run.log.metadata.get("run", {}).get("certificate_problems", "")
     problems = [problem for problem in noted.split("; ") if problem]
     for message in run.log.messages("/event"):

@@ -260,8 +260,7 @@ class Engine:
         if snapshot:
             self.recorder.snapshot(reason, ended, SNAPSHOT_S, SNAPSHOT_S)
         for role, device in self.bench.devices.items():
-            counted = ", ".join(f"{key}={value}" for key, value in sorted(device.counters.items()) if value)
-            self.recorder.event("info", role, f"counted: {counted or 'nothing'}")
+            self.recorder.counters(role, device.counters)
         if error is not None:
             self.recorder.event("error", "engine", reason)
         return self._outcome(status, reason, rest), error
@@ -334,11 +333,7 @@ class Engine:
     def _check_identity(self, role: str) -> None:
         table, device = self.bench.scene.instruments[role], self.bench.devices[role]
         found = device.identity
-        known = {**device.settings, **self.bench.link_settings(role)}
-        settings = ", ".join(f"{key}={value}" for key, value in sorted(known.items()))
-        self.recorder.event(
-            "info", role, f"model {found.model}, serial {found.serial}, firmware {found.firmware}; {settings}"
-        )
+        self.recorder.identity(role, found, {**device.settings, **self.bench.link_settings(role)})
         if table.serial is not None and table.serial != found.serial:
             raise ConfigError(
                 f"{role}: serial number {table.serial} is wanted, but {found.serial or 'no serial number'} "
@@ -348,6 +343,7 @@ class Engine:
         if certificate is not None:
             today = datetime.fromtimestamp(self.clock.epoch_ns(self.clock.now()) * 1e-9, UTC).date()
             for problem in certificate.check(found.serial, today):
+                self.recorder.certificate_problem(role, problem)
                 self.recorder.event("warning", role, problem)
 
     def _check_output(self) -> None:

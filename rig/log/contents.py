@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 # In a log's metadata: on what bench it was. In memory its truth is that of its own scene.
 IN_MEMORY, ON_PORTS = "simulated in memory", "real ports"
 
-_SAID = re.compile(r"model (.*?), serial (.*?), firmware (.*?)(?:;|$)")
+# Older logs say it in one sentence. A model may hold commas; serial number and firmware do not.
+_SAID = re.compile(r"model (.*), serial ([^,;]*), firmware ([^,;]*)(?:;|$)")
 
 
 def certificates_in(log: Log) -> dict[str, Certificate]:
@@ -43,6 +44,11 @@ def certificates_in(log: Log) -> dict[str, Certificate]:
 def identities_in(log: Log) -> dict[str, Identity]:
     """What each instrument stated of itself at the start of the run, by role."""
     found: dict[str, Identity] = {}
+    for message in log.messages("/identity"):
+        fields = message.fields
+        found.setdefault(fields["device"], Identity(fields["model"], fields["serial"], fields["firmware"]))
+    if found:
+        return found
     for message in log.messages("/event"):
         said = _SAID.match(message.fields["message"])
         if said is not None:

@@ -245,7 +245,7 @@ def load_run(path: Path, latency: Mapping[str, float] | None = None) -> Run:
         phase=np.searchsorted([phase.t for phase in phases], t, side="right") - 1,
         phases=phases,
         references=references,
-        force_per_reading=_gain(newton, reading - _newest(t, references, "force_zero")),
+        force_per_reading=_force_gain(log, newton, reading - _newest(t, references, "force_zero")),
     )
 
 
@@ -292,6 +292,14 @@ def _newest(t: Floats, references: list[Reference], name: str) -> Floats:
     found = [reference for reference in references if reference.name == name]
     values = np.array([np.nan, *(reference.value for reference in found)])
     return values[np.searchsorted([reference.t for reference in found], t, side="right")]
+
+
+def _force_gain(log: Log, force: Floats, net_reading: Floats) -> float:
+    """Newtons per unit of the reading, as the log states it; of older logs, as it shows in the samples."""
+    try:
+        return float(log.metadata["gains"]["force"])
+    except (KeyError, ValueError):
+        return _gain(force, net_reading)
 
 
 def _gain(force: Floats, net_reading: Floats) -> float:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rig.base.text import printable
+from rig.log.contents import identities_in
 from rig.log.reader import Log, read_log
 from rig.log.schema import ROLES
 
@@ -47,10 +48,10 @@ def _state(log: Log) -> str:
 def _devices(log: Log) -> list[str]:
     """What each instrument said of itself at the start of the run."""
     lines = ["devices"]
-    said: dict[str, str] = {}
-    for message in log.messages("/event"):
-        if message.fields["message"].startswith("model "):
-            said.setdefault(message.fields["source"], message.fields["message"].split(";")[0])  # not its settings
+    said = {
+        role: f"model {one.model or '-'}, serial {one.serial or '-'}, firmware {one.firmware or '-'}"
+        for role, one in identities_in(log).items()
+    }
     for role in ROLES:
         if any(topic.startswith((f"/{role}/", f"/raw/{role}/")) for topic in log.topics):
             lines.append(_row(role, said.get(role, "")))

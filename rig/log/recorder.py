@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from drivers.roles import DisplacementSample, ForceSample, HVSample, Sample, StageSample
+from drivers.roles import DisplacementSample, ForceSample, HVSample, Identity, Sample, StageSample
 from rig.base.clock import Clock
 from rig.base.errors import FaultError
 from rig.log import space
@@ -152,6 +152,24 @@ class Recorder:
         """Write something that a reader of the log should know."""
         self._write("/event", self._clock.now(), severity=severity, source=source, message=message)
 
+    def identity(self, device: str, identity: Identity, settings: Mapping[str, str]) -> None:
+        """Write who answered as a device, and what was read back from it."""
+        t = self._clock.now()
+        self._write(
+            "/identity", t, device=device, model=identity.model, serial=identity.serial, firmware=identity.firmware
+        )
+        for name, value in sorted(settings.items()):
+            self._write("/setting", t, device=device, name=name, value=value)
+
+    def certificate_problem(self, device: str, problem: str) -> None:
+        """Write what speaks against using a certificate."""
+        self._write("/certificate_problem", self._clock.now(), device=device, problem=problem)
+
+    def counters(self, device: str, counters: Mapping[str, int]) -> None:
+        """Write what a device has counted; from then on it is only closed."""
+        for name, count in sorted(counters.items()) or [("none", 0)]:
+            self._write("/counter", self._clock.now(), device=device, name=name, count=count)
+
     def reference(self, name: str, value: float, standard_uncertainty: float, unit: str) -> None:
         """Write a reference taken during the run (a zero, the contact position)."""
         self._write(
@@ -164,8 +182,10 @@ class Recorder:
         )
 
     def units(self, force: str) -> None:
-        """Write the unit of what has none in its name: the readings of the force sensor."""
+        """Write the unit of the force sensor's readings, which have none in their name, and all gains."""
         self._metadata("units", {"/force/sample reading": force})
+        gains = {"force": self._gains.force, "displacement": self._gains.displacement, "voltage": self._gains.voltage}
+        self._metadata("gains", {name: repr(gain) for name, gain in gains.items()})
 
     def snapshot(self, cause: str, at: float, before: float, after: float) -> None:
         """Mark the seconds around what went wrong: every sample of theirs is in the log."""

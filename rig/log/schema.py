@@ -150,6 +150,42 @@ CHANNELS: dict[str, Channel] = {
             Field("message", "string", "what happened"),
         ),
     ),
+    "/identity": Channel(
+        "Identity",
+        (
+            _T,
+            Field("device", "string", "the device's name in the scene"),
+            Field("model", "string", "as the device states it; empty where it does not"),
+            Field("serial", "string", "serial number as the device states it; empty where it does not"),
+            Field("firmware", "string", "firmware as the device states it; empty where it does not"),
+        ),
+    ),
+    "/setting": Channel(
+        "Setting",
+        (
+            _T,
+            Field("device", "string", "the device's name in the scene"),
+            Field("name", "string", "what was read back from the device or set on its link"),
+            Field("value", "string", "its value, the unit in the name"),
+        ),
+    ),
+    "/certificate_problem": Channel(
+        "CertificateProblem",
+        (
+            _T,
+            Field("device", "string", "the device's name in the scene"),
+            Field("problem", "string", "what speaks against using the certificate: its date, another serial number"),
+        ),
+    ),
+    "/counter": Channel(
+        "Counter",
+        (
+            _T,
+            Field("device", "string", "the device's name in the scene; after this it is no longer polled, only closed"),
+            Field("name", "string", "what was counted during the run: retries, dropped bytes and the like"),
+            Field("count", "sfixed64", "how often"),
+        ),
+    ),
     **{f"/raw/{role}/{way}": _RAW for role in ROLES for way in ("rx", "tx")},
 }
 

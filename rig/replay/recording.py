@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -125,6 +125,15 @@ class Recording:
     def in_virtual_time(self) -> bool:
         """Whether the run's clock was a virtual one, so that its times come out the same again."""
         return self.log.metadata.get("run", {}).get("bench") != ON_PORTS
+
+
+def counted_device(topic: str, fields: Mapping[str, Any]) -> str:
+    """The device whose polling has ended with this row, since its counters are written; empty if none."""
+    if topic == "/counter":
+        return str(fields["device"])
+    if topic == "/event" and str(fields["message"]).startswith("counted: "):  # as older logs say it
+        return str(fields["source"])
+    return ""
 
 
 def numbers(argument: str) -> list[float]:

@@ -26,11 +26,10 @@ from rig.bench.opening import open_memory
 from rig.bench.tap import Tap
 from rig.bench.wired import Wired
 from rig.engine.engine import SHORTEST_TURN_S
-from rig.replay.recording import Recording, Row
+from rig.replay.recording import Recording, Row, counted_device
 from rig.scene.scene import Scene
 
 DECISIONS = ("/phase", "/target", "/reference", "/command")
-COUNTED = "counted: "  # an event that says so is the end of polling
 NANOSECONDS = 1e-8  # to which the times of turns are known
 PATIENCE_S = 0.1  # by how much a decision may come sooner or later than then: less than any device is silent for
 PATIENCE_TURNS = round(PATIENCE_S / SHORTEST_TURN_S)
@@ -184,8 +183,8 @@ def _seconds(ns: int) -> float:
 
 
 def _is_decision(topic: str, fields: Mapping[str, Any]) -> bool:
-    if topic == "/event":
-        return str(fields["message"]).startswith(COUNTED)
+    if counted_device(topic, fields):
+        return True
     return topic in DECISIONS and fields.get("device", "stage") == "stage"
 
 
@@ -213,8 +212,8 @@ def _entries(recording: Recording) -> list[_Turn | _Decision]:
         elif _is_decision(row.topic, row.fields) and not closed:
             entries.append(_Decision(row.t, row.topic, place))
             turn = None  # what comes in the same turn comes after it
-        if topic == "event" and row.fields["message"].startswith(COUNTED):
-            closed.add(row.fields["source"])
+        if device := counted_device(row.topic, row.fields):
+            closed.add(device)
     return entries
 
 

@@ -21,7 +21,7 @@ from rig.bench.opening import open_memory
 from rig.log import schema
 from rig.log.recorder import Recorder
 from rig.protocol.experiment import gains_of
-from rig.replay.recording import Recording, Row, numbers
+from rig.replay.recording import Recording, Row, counted_device, numbers
 from rig.scene.scene import Scene
 from rig.sim.wire import ByteWire, Frame, FrameWire
 
@@ -236,6 +236,10 @@ class _Verifier:
 
     def _take(self, row: Row) -> None:
         self._until = max(self._until, row.t)
+        device = counted_device(row.topic, row.fields)
+        if device in self._streams and device != GUARDED:  # what comes after that is said in closing
+            self._poll(device)
+            self._streams[device].counted = True
         match row.topic.split("/")[1:]:
             case ["raw", role, way] if role in self._streams:
                 self._on_wire(role, way, row.t, row.fields["data"])
@@ -249,8 +253,6 @@ class _Verifier:
                 self._command(row.fields)
             case ["event"] if row.fields["source"] in self._streams and row.fields["source"] != GUARDED:
                 self._poll(row.fields["source"])
-                if row.fields["message"].startswith("counted: "):  # what comes after that is said in closing
-                    self._streams[row.fields["source"]].counted = True
             case ["reference"]:
                 self._reference(row.fields["name"], row.fields["value"])
 

@@ -118,10 +118,8 @@ SEEN_DAMAGE = {
 
 def counted(story: Any, role: str) -> dict[str, int]:
     """The driver's counters as the log has them at the end of the run."""
-    events = [m.fields for m in read_log(story.log).messages("/event") if m.fields["source"] == role]
-    text = next(e["message"] for e in reversed(events) if e["message"].startswith("counted: "))
-    pairs = (part.split("=") for part in text.removeprefix("counted: ").split(", ") if "=" in part)
-    return {key: int(value) for key, value in pairs}
+    rows = [m.fields for m in read_log(story.log).messages("/counter")]
+    return {row["name"]: row["count"] for row in rows if row["device"] == role}
 
 
 @pytest.mark.parametrize("driver", LITTLE)

@@ -36,16 +36,11 @@ def test_a_damaged_log_says_so(small):
 def test_devices_and_control_characters(tmp_path):
     with LogWriter(tmp_path / "a.mcap") as log:
         log.metadata("run", {"scene": "\x1b[31mred"})
-        event = {
-            "t_s": 0.0,
-            "severity": "info",
-            "source": "stage",
-            "message": "model X, serial \x1b]0,owned\x07; rate=100",
-        }
-        log.write("/event", event, 0, 0)
+        who = {"t_s": 0.0, "device": "stage", "model": "X", "serial": "\x1b]0,owned\x07", "firmware": "7.14"}
+        log.write("/identity", who, 0, 0)
         log.write("/raw/stage/rx", {"t_s": 0.0, "data": b"x"}, 0, 0)
         log.finish({})
     text = info(tmp_path / "a.mcap")
     assert "\x1b" not in text and "\x07" not in text
     assert r"model X, serial \x1b]0,owned\x07" in text
-    assert "rate=100" not in text
+    assert "firmware 7.14" in text

@@ -157,3 +157,25 @@ def test_every_step_can_be_gone_on_with() -> None:
             assert before.h[1] == rest[0].h[0] and before.voltage[1] == rest[0].voltage[0]
     with pytest.raises(ConfigError, match="Nothing but the way back"):
         plan_from(protocol, scene, 10)
+
+
+@pytest.mark.parametrize("board", ["HVPS 7, serial 3", "serial 3, firmware 9; x", "counted: 1"])
+def test_a_board_may_be_called_anything(tmp_path, board):
+    """Its label is no serial number: the board has none, and none is asked for when the run goes on."""
+    scene = (SCENE.parent / "other-instruments.toml").read_text()
+    scene = scene.replace("[simulation.hv]", f'[simulation.hv]\nboard = "{board}"')
+    assert board in scene
+    for name in ("force-can", "displacement", "hv-shvps"):
+        scene = scene.replace(
+            f"../calibrations/{name}.toml", str(SCENE.parent.parent / "calibrations" / f"{name}.toml")
+        )
+    (tmp_path / "scene.toml").write_text(scene)
+    (tmp_path / "protocol.toml").write_text(PROTOCOL)
+    experiment = prepare(tmp_path / "scene.toml", tmp_path / "protocol.toml")
+    with pytest.raises(Stopped):
+        run(experiment, tmp_path / "a.mcap", stop_when("zero"))
+    resumed = prepare_resumed(tmp_path / "a.mcap")
+    assert resumed.scene.hv.serial is None
+    assert resumed.scene.force.serial == "77120"
+    with pytest.raises(Stopped):  # who answers is who is wanted
+        run(resumed, tmp_path / "b.mcap", stop_when("zero"))
