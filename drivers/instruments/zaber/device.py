@@ -258,11 +258,11 @@ class ZaberStage:
         high = yield from self._number("get limit.max")
         max_speed = yield from self._number("get maxspeed")
         acceleration = yield from self._number("get accel")
-        if not (resolution > 0 and low < high and max_speed > 0):
+        if not (resolution > 0 and low < high and max_speed > 0 and acceleration >= 0):
             raise DeviceRefused(
                 self._label,
                 f"its settings make no sense: resolution {resolution}, limit.min {low}, limit.max {high}, "
-                f"maxspeed {max_speed}",
+                f"maxspeed {max_speed}, accel {acceleration}",
                 "Restore its settings in the maker's software.",
             )
         self._step = self._full_step / resolution

@@ -342,6 +342,31 @@ def test_resolution_of_the_device_is_used(fake: FakeStage) -> None:
     assert bench.samples[0].position == pytest.approx(1000 * 0.248046875e-6)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "allowed"),
+    [
+        ("resolution", "0", "1"),
+        ("limit.min", "305381", "305380"),  # no travel at all
+        ("limit.max", "0", "1"),
+        ("maxspeed", "0", "1"),
+        ("accel", "-1", "0"),  # 0: it has no ramp
+    ],
+)
+def test_one_senseless_setting_is_enough_to_refuse_the_stage(
+    fake: FakeStage, key: str, value: str, allowed: str
+) -> None:
+    fake.settings[key] = value
+    bench = Bench(ZaberStage("stage", fake), fake)
+    with pytest.raises(DeviceRefused, match=rf"its settings make no sense: .*{key} {value}\b"):
+        bench.run(0.2)
+    assert not bench.stage.ready
+    sensible = FakeStage()
+    sensible.settings[key] = allowed
+    bench = Bench(ZaberStage("stage", sensible), sensible)
+    bench.run(0.2)
+    assert bench.stage.ready
+
+
 def test_stage_without_reply_checksums_is_told_to_send_them(fake: FakeStage) -> None:
     fake.checksums = False
     bench = Bench(ZaberStage("stage", fake), fake)

@@ -1,0 +1,158 @@
+"""What instruments declare, one row for each of their keys: described, with the documented default and range."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, get_args
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
+
+from drivers.instrument import Instrument
+from drivers.registry import registered
+from drivers.settings import InstrumentSettings
+
+INSTRUMENTS = list(registered().instruments.values())
+
+# driver, key: default, smallest, largest as the documentation has them; "(0" excludes the 0 itself, "-" is none.
+DOCUMENTED = """
+zaber        timeout_s               0.25      (0     10
+zaber        baud                    115200    (0     -
+zaber        poll_rate_Hz            50.0      5      200
+zaber        approach_from_mm        0.0       0      -
+zaber        device                  1         1      99
+zaber        axis                    1         1      9
+zaber        full_step_um            31.75     (0     -
+gsv8         timeout_s               0.25      (0     10
+gsv8         baud                    230400    (0     -
+gsv8         channel                 1         1      8
+gsv8         rate_Hz                 100.0     (0     2000
+gsv8         int_full_scale          1.05      0.5    2
+gsv8         input_range_mV_per_V    None      (0     1000
+cia404       timeout_s               0.25      (0     10
+cia404       bitrate                 125000    (0     -
+cia404       node                    1         1      127
+cia404       channel                 1         1      199
+cia404       rate_Hz                 100.0     (0     1000
+cia404       factor                  1.0       -      -
+cia404       limit_N                 10000.0   (0     -
+keyence-lkg  timeout_s               0.25      (0     10
+keyence-lkg  baud                    115200    (0     -
+keyence-lkg  output                  1         1      2
+keyence-lkg  poll_rate_Hz            50.0      5      200
+keyence-lkg  unit_mm                 1.0       (0     -
+keyence-lkg  limit_mm                80.0      (0     -
+iseg-edcp    timeout_s               0.25      (0     10
+iseg-edcp    bitrate                 125000    (0     -
+iseg-edcp    ramp_V_per_s            100.0     (0     -
+iseg-edcp    parallel_capacitance_nF 0.0       0      -
+iseg-edcp    module                  0         0      63
+iseg-edcp    channel                 0         0      23
+iseg-edcp    max_ramp_percent_per_s  20.0      (0     100
+iseg-edcp    poll_rate_Hz            10.0      (0     50
+shvps        timeout_s               0.25      (0     10
+shvps        baud                    115200    (0     -
+shvps        ramp_V_per_s            100.0     (0     -
+shvps        parallel_capacitance_nF 0.0       0      -
+shvps        poll_rate_Hz            10.0      (0     20
+"""
+ROWS = [line.split() for line in DOCUMENTED.strip().splitlines()]
+
+
+def settings_of(driver: str) -> type[InstrumentSettings]:
+    return next(one.settings for one in INSTRUMENTS if one.driver == driver)
+
+
+def numeric(field: FieldInfo) -> bool:
+    kinds = {field.annotation, *get_args(field.annotation)}
+    return bool(kinds & {int, float})
+
+
+def accepts(driver: str, key: str, value: Any) -> bool:
+    """Whether a scene may say it, the other keys being as usual."""
+    table = {"driver": driver, "certificate": "c.toml", key: value}
+    if driver == "cia404" and key == "factor":
+        table["unit"] = "N"
+    try:
+        settings_of(driver).model_validate(table)
+    except ValidationError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("one", INSTRUMENTS, ids=lambda one: one.driver)
+def test_every_key_is_described(one: Instrument) -> None:
+    for name, field in one.settings.model_fields.items():
+        assert field.description and len(field.description) > 10, f"{one.driver}: {name} has no description"
+        assert field.description.endswith("."), name
+        for unit in ("_Hz", "_um", "_mm", "_N", "_s", "_nF"):
+            if name.endswith(unit) and "per" not in name:
+                assert f"({unit[1:]}" in field.description, (
+                    f"{one.driver}: the unit of {name} is not in its description"
+                )
+
+
+def test_every_number_is_documented_here() -> None:
+    built_in = [one for one in INSTRUMENTS if one.settings.__module__.startswith("drivers.")]
+    keys = {(one.driver, name) for one in built_in for name, f in one.settings.model_fields.items() if numeric(f)}
+    assert {(driver, key) for driver, key, *_ in ROWS} == keys
+
+
+@pytest.mark.parametrize(("driver", "key", "default", "low", "high"), ROWS)
+def test_default_and_range_are_the_documented_ones(driver: str, key: str, default: str, low: str, high: str) -> None:
+    field = settings_of(driver).model_fields[key]
+    assert repr(field.default) == default
+    whole = int in {field.annotation, *get_args(field.annotation)}
+
+    def beside(text: str, way: float) -> Any:
+        number = float(text)
+        return int(number + way) if whole else math.nextafter(number, math.copysign(math.inf, way))
+
+    def at(text: str) -> Any:
+        return int(text) if whole else float(text)
+
+    if low.startswith("("):
+        assert not accepts(driver, key, at(low[1:])) and accepts(driver, key, beside(low[1:], +1))
+    elif low != "-":
+        assert accepts(driver, key, at(low)) and not accepts(driver, key, beside(low, -1))
+    if high != "-":
+        assert accepts(driver, key, at(high)) and not accepts(driver, key, beside(high, +1))
+    if not whole:
+        assert not accepts(driver, key, math.nan) and not accepts(driver, key, math.inf)
+
+
+@pytest.mark.parametrize("one", INSTRUMENTS, ids=lambda one: one.driver)
+def test_no_key_of_another_instrument_is_taken(one: Instrument) -> None:
+    keys = {name for other in INSTRUMENTS for name in other.settings.model_fields} - set(one.settings.model_fields)
+    table = {"driver": one.driver, "certificate": "c.toml"}
+    TypeAdapter(one.settings).validate_python(table)
+    for key in (*keys, "no_such_key"):
+        with pytest.raises(ValidationError, match="Extra inputs"):
+            one.settings.model_validate({**table, key: 1})
+
+
+@pytest.mark.parametrize("one", INSTRUMENTS, ids=lambda one: one.driver)
+def test_what_names_its_port_makes_it_connected(one: Instrument) -> None:
+    table: dict[str, Any] = {"driver": one.driver, "certificate": "c.toml"}
+    assert not one.settings.model_validate(table).connected
+    where = {"port": "p", "interface": "virtual", "can_channel": "c", "host": "127.0.0.1"}
+    placed = one.settings.model_validate({**table, **{key: where[key] for key in one.settings.place_keys}})
+    assert placed.connected
+    assert placed.sample_rate == getattr(placed, one.settings.rate_key) > 0
+
+
+@pytest.mark.parametrize("key", ["interface", "can_channel"])
+def test_an_adapter_and_its_channel_come_together(key: str) -> None:
+    for driver in ("cia404", "iseg-edcp"):
+        assert not accepts(driver, key, "virtual")
+
+
+def test_a_factor_needs_a_unit_and_is_not_0() -> None:
+    table = {"driver": "cia404", "certificate": "c.toml"}
+    settings = settings_of("cia404")
+    settings.model_validate({**table, "factor": 2.0, "unit": "N"})
+    settings.model_validate({**table, "unit": "mV/V"})
+    for wrong, word in (({"factor": 2.0}, "unit"), ({"factor": 0.0, "unit": "N"}, "must not be 0")):
+        with pytest.raises(ValidationError, match=word):
+            settings.model_validate({**table, **wrong})
