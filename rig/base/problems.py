@@ -136,30 +136,38 @@ def place_of(table: type[BaseModel], raw: Any, location: Sequence[int | str]) ->
 def _enter_item(place: Place, number: int) -> None:
     name = f"{place.keys.pop()} {number + 1}" if place.keys else f"item {number + 1}"
     place.keys.append(name)
-    place.types = [one for kind in place.types for argument in get_args(kind) for one in options(argument)]
     known = isinstance(place.value, list) and number < len(place.value)
     place.value = place.value[number] if known else None
+    place.types = [one for kind in place.types for inner in get_args(kind) for one in options(inner, place.value)]
 
 
 def _enter_key(place: Place, key: str) -> None:
     place.keys.append(key)
     place.tables = [one for one in place.types if _is_table(one)]
     place.field = next((one.model_fields[key] for one in place.tables if key in one.model_fields), None)
-    if place.field is not None:
-        place.types = options(place.field.annotation)
-    else:  # a table of any keys, or an unknown key
-        place.types = [one for kind in place.types if get_origin(kind) is dict for one in options(get_args(kind)[1])]
     place.value = place.value.get(key) if isinstance(place.value, Mapping) else None
+    if place.field is not None:
+        place.types = _chosen(place.field.metadata, place.value) or options(place.field.annotation, place.value)
+    else:  # a table of any keys, or an unknown key
+        inner = [get_args(kind)[1] for kind in place.types if get_origin(kind) is dict]
+        place.types = [one for kind in inner for one in options(kind, place.value)]
 
 
-def options(annotation: Any) -> list[Any]:
-    """The types that an annotation allows, without None and without what is said about them."""
+def options(annotation: Any, value: Any = None) -> list[Any]:
+    """The types that an annotation allows, without None; of a registry's tables the one that ``value`` names."""
     origin = get_origin(annotation)
     if origin is Annotated:
-        return options(get_args(annotation)[0])
+        kind, *said = get_args(annotation)
+        return _chosen(said, value) or options(kind, value)
     if origin in (Union, UnionType):
-        return [one for argument in get_args(annotation) for one in options(argument)]
+        return [one for argument in get_args(annotation) for one in options(argument, value)]
     return [] if annotation in (None, NoneType) else [annotation]
+
+
+def _chosen(said: Sequence[Any], value: Any) -> list[Any]:
+    """The table that a value names where a registry (`rig.base.choice.Choice`) stands beside the type."""
+    tables = [one.table_of(value) for one in said if hasattr(one, "table_of")]
+    return [table for table in tables if table is not None]
 
 
 def _is_table(kind: Any) -> bool:

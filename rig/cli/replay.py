@@ -20,7 +20,7 @@ def command(log: Path, verify: bool, rerun: bool) -> None:
     recorded and what is decoded today; for --rerun with both requests in hex and the step of the protocol.
 
     Exit code 0: all is as recorded; 3: all is, as far as the log is whole (it says how far); 1: something differs, or
-    the log cannot be used.
+    this version cannot read the log; 2: there is no such log.
     """
     from rig.replay.recording import load_recording
     from rig.replay.rerun import rerun as run_again

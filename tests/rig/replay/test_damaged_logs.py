@@ -69,7 +69,7 @@ def test_exit_codes(tmp_path, monkeypatch):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(NO_HV.read_bytes()[:100_000])
     assert replay(cut, "--verify").exit_code == 3
-    assert replay(tmp_path / "none.mcap").exit_code == 1
+    assert replay(tmp_path / "none.mcap").exit_code == 2
     monkeypatch.setattr("drivers.instruments.zaber.ZaberStage._speed_data", lambda self, speed: 1000)
     different = replay(NO_HV, "--verify", "--rerun")
     assert different.exit_code == 1
