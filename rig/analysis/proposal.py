@@ -20,12 +20,22 @@ from model.membrane.solve import Status, solve_many
 from model.specimen import Specimen
 from rig.analysis.film import errors_of
 from rig.base.errors import ConfigError, LimitError
-from rig.protocol import protocol as steps
 from rig.protocol.experiment import certificates_of
-from rig.protocol.plan import check_plan, plan
+from rig.protocol.plan import plan
+from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
 from rig.safety.limits import Limits
 from rig.scene.scene import Scene, load_scene
+from rig.steps.approach import Approach
+from rig.steps.base import Step
+from rig.steps.hold import Hold
+from rig.steps.home import Home
+from rig.steps.precondition import Precondition
+from rig.steps.ramp import Ramp
+from rig.steps.return_ import Return
+from rig.steps.sweep import Sweep
+from rig.steps.voltage import Voltage
+from rig.steps.zero import Zero
 
 Array = NDArray[np.float64]
 
@@ -151,7 +161,7 @@ def _reachable(scene: Scene, specimen: Specimen) -> tuple[Array, Array, float, f
 
 
 def _protocol(
-    scene: Scene, certificates: Mapping[str, Certificate], middle: Sequence[steps.Step], top_h: float, title: str = ""
+    scene: Scene, certificates: Mapping[str, Certificate], middle: Sequence[Step], top_h: float, title: str = ""
 ) -> Protocol:
     """A protocol with ``middle`` as its measuring steps, framed by what every one needs."""
     speed = min(SPEED_MM_PER_S, scene.limits.speed_mm_per_s)
@@ -160,14 +170,14 @@ def _protocol(
     return Protocol(
         title=title,
         step=[
-            steps.Home(do="home"),
-            steps.Zero(do="zero", duration_s=ZERO_S),
-            steps.Approach(
+            Home(do="home"),
+            Zero(do="zero", duration_s=ZERO_S),
+            Approach(
                 do="approach", speed_mm_per_s=min(0.5, speed), threshold_mN=math.ceil(6e3 * noise), max_travel_mm=10.0
             ),
-            steps.Precondition(do="precondition", displacement_mm=_mm(top_h), speed_mm_per_s=speed, cycles=2),
+            Precondition(do="precondition", displacement_mm=_mm(top_h), speed_mm_per_s=speed, cycles=2),
             *middle,
-            steps.Return(do="return", speed_mm_per_s=min(2.0, speed)),
+            Return(do="return", speed_mm_per_s=min(2.0, speed)),
         ],
     )
 
@@ -177,7 +187,7 @@ def _sweep(scene: Scene, certificates: Mapping[str, Certificate], time: float, t
     voltages = [0.0, *(float(round(share * top_v / 10.0) * 10.0) for share in (2.0 / 3.0, 1.0))] if top_v else [0.0]
 
     def at(speed: float) -> Protocol:
-        sweep = steps.Sweep(
+        sweep = Sweep(
             do="sweep", displacement_mm=_mm(top_h), speed_mm_per_s=speed, voltages_V=voltages, settle_s=SETTLE_S
         )
         return _protocol(scene, certificates, [sweep], top_h, "Uniform sweep")
@@ -206,17 +216,17 @@ def _trimmed(scene: Scene, certificates: Mapping[str, Certificate], route: Seque
     return protocol
 
 
-def _steps(route: Sequence[Dwell], scene: Scene) -> list[steps.Step]:
+def _steps(route: Sequence[Dwell], scene: Scene) -> list[Step]:
     speed = min(SPEED_MM_PER_S, scene.limits.speed_mm_per_s)
-    found: list[steps.Step] = []
+    found: list[Step] = []
     h = voltage = 0.0
     for dwell in route:
-        there = [steps.Ramp(do="ramp", displacement_mm=_mm(dwell.h), speed_mm_per_s=speed)] if dwell.h != h else []
+        there = [Ramp(do="ramp", displacement_mm=_mm(dwell.h), speed_mm_per_s=speed)] if dwell.h != h else []
         changed = dwell.voltage != voltage
-        charged = [steps.Voltage(do="voltage", voltage_V=dwell.voltage, settle_s=SETTLE_S)] if changed else []
+        charged = [Voltage(do="voltage", voltage_V=dwell.voltage, settle_s=SETTLE_S)] if changed else []
         # The film is moved at the lower voltage of the two: that it bears.
         found += [*charged, *there] if dwell.voltage < voltage else [*there, *charged]
-        found.append(steps.Hold(do="hold", duration_s=max(dwell.seconds, 0.1)))
+        found.append(Hold(do="hold", duration_s=max(dwell.seconds, 0.1)))
         h, voltage = dwell.h, dwell.voltage
     return found
 

@@ -16,10 +16,11 @@ from calibration.sensors.sensor import Characteristic, SensorError, Standstill, 
 from drivers.roles import Identity
 from rig.base.errors import DataError
 from rig.base.toml_file import parse_table
-from rig.calibrate import steps
 from rig.log.contents import identities_in
 from rig.log.dataset import Phase, Run, load_run
 from rig.protocol.protocol import Protocol
+from rig.steps.meter import Meter
+from rig.steps.weigh import Weigh
 
 Quantity = Literal["force", "displacement", "hv", "compliance", "timing"]
 QUANTITIES: tuple[Quantity, ...] = ("force", "displacement", "compliance", "hv", "timing")
@@ -132,7 +133,7 @@ def standstills(run: Run, quantity: Quantity) -> list[Standstill]:
         When there is none.
     """
     t, readings = _readings(run, quantity)
-    mine_are = {number for number, step in enumerate(_protocol(run).step, start=1) if step.do == _STEP[quantity]}
+    mine_are = {number for number, step in enumerate(_protocol(run).step, start=1) if step.kind == _STEP[quantity]}
     applied = [one for one in run.references if one.name == "applied" and one.unit == UNIT[quantity]]
     found = []
     for phase, end in _phases(run, "standstill"):
@@ -203,11 +204,11 @@ def common_uncertainties(run: Run, quantity: Quantity) -> dict[str, float]:
         return {"force certificate": force.gain_uncertainty} if force is not None else {}
     common: dict[str, float] = {}
     for step in _protocol(run).step:
-        if isinstance(step, steps.Weigh) and quantity == "force":
+        if isinstance(step, Weigh) and quantity == "force":
             common["local gravity"] = step.gravity_uncertainty_m_per_s2 / step.gravity_m_per_s2
             # A tenth of the buoyancy: air pressure, temperature and humidity as in any laboratory.
             common["air buoyancy"] = 0.1 * step.air_density_kg_per_m3 / step.density_kg_per_m3
-        elif isinstance(step, steps.Meter) and quantity == "hv":
+        elif isinstance(step, Meter) and quantity == "hv":
             common["reference meter"] = step.meter_relative_uncertainty
     return common
 

@@ -25,11 +25,10 @@ from model.material.materials import Material
 from rig.analysis.fit_file import FittedFilm, read_fit
 from rig.base.errors import DataError
 from rig.base.toml_file import parse_table
-from rig.follow.plan import rest_from
 from rig.log.dataset import Phase, Run, load_run
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import Scene
-from rig.steps.follow import Follow
+from rig.steps.follow import Follow, rest_from
 
 Floats = NDArray[np.float64]
 

@@ -281,6 +281,11 @@ def _rule(place: Place, problem: ErrorDetails) -> str:
         case "union_tag_not_found":
             key = str(context["discriminator"]).strip("'").removesuffix("()") or "kind"
             return f"the key {key} is missing, which says what kind of table this is; allowed are {_tags(place, key)}"
+        case "choice_unknown":
+            return _one_of(str(value), context["allowed"])
+        case "choice_missing":
+            allowed = ", ".join(shown(name) for name in context["allowed"])
+            return f"this key is missing, which says what kind of table this is; allowed are {allowed}"
         case "date_type" | "date_parsing" | "date_from_datetime_parsing" | "date_from_datetime_inexact":
             return "a date without quotes is needed here: 2026-01-31"
     return "this value cannot be used here"

@@ -10,27 +10,29 @@ run or hastens the teardown, a pause lets the voltage down and, once continued, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from drivers.links.link import DeviceError, DeviceSilent
 from drivers.roles import HVSample, Sample
-from rig.actions import Turns, carry_out, choose_about_live_output, confirm_voltage, rest
 from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.base.host import HostTime
 from rig.bench.bench import Bench
+from rig.engine.outcome import Outcome
+from rig.engine.pause import pause
 from rig.engine.teardown import Rest, Teardown
 from rig.engine.watch import Watch, allowed_silence
 from rig.log.recorder import Gains, Recorder, Severity
-from rig.operator.control import Answer, Control, Question
-from rig.protocol.plan import Action
+from rig.operator.control import Control
 from rig.safety import heartbeat
 from rig.safety.arming import Arming
-from rig.safety.guard import AnyGuard, Guard, GuardState
+from rig.safety.guard import AnyGuard, Guard
 from rig.safety.limits import FilmLimits, Limit, Limits
+from rig.steps.base import Action, Turns, write_phase
+from rig.steps.output import choose_about_live_output, confirm_voltage
+from rig.steps.rig import Rig
 
 if TYPE_CHECKING:
     from calibration.sensors.certificate import Certificate
@@ -42,51 +44,7 @@ SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these 
 SETUP_LIMIT_S = 15.0
 SNAPSHOT_S = 1.0  # before and after what ended a run under voltage: the log holds every sample of it, and says where
 ROUNDING_S = 1e-6  # of clock times: whether a turn is the last one must not hang on the last digit
-HANDS = ("prompt", "mount", "weigh", "creep")  # kinds of actions in which the operator touches the rig
 OUTPUT_LIMIT_S = 3.0  # how long a supply may take after set-up to be measured off
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Why the run ended, and the measured state it ended in.
-
-    ``status`` is one of complete, stopped, limit, fault. ``safe`` is True only when the output was *measured* below
-    60 V twice, or when the scene has no HV; ``standing`` only when the stage said that it stands still.
-    """
-
-    status: str
-    reason: str
-    safe: bool
-    standing: bool
-    voltage: float
-    force: float
-    position: float
-    duration: float
-
-    @property
-    def state(self) -> str:
-        """The state of stage and output, in words for the operator."""
-        stage = "stage standing" if self.standing else "stage NOT CONFIRMED to stand, it may be moving: cut its power"
-        if math.isnan(self.voltage):
-            output = "no high voltage in this scene" if self.safe else "high voltage NOT SAFE: never measured"
-        else:
-            output = (
-                f"high voltage {'off, measured' if self.safe else 'NOT SAFE, last measured'} {round(self.voltage)} V"
-            )
-        return f"{stage}; {output}"
-
-    def as_text(self) -> dict[str, str]:
-        """As the log's metadata: text only, units in the names."""
-        return {
-            "status": self.status,
-            "reason": self.reason,
-            "safe": "yes" if self.safe else "NO",
-            "stage_standing": "yes" if self.standing else "NOT CONFIRMED",
-            "measured_voltage_V": f"{self.voltage:.1f}",
-            "measured_force_N": f"{self.force:.5f}",
-            "stage_position_mm": f"{self.position * 1e3:.4f}",
-            "duration_s": f"{self.duration:.3f}",
-        }
 
 
 def _lets_ramp_down(error: Exception) -> bool:
@@ -141,16 +99,13 @@ class Engine:
         self.gains = gains
         self.recorder = Recorder(log, self.clock, gains, has_laser=bench.scene.displacement is not None)
         self.limits = Limits.of(bench.scene)
-        self.force_noise = math.nan
-        self.listener: Callable[[Sample], None] | None = None
         self.control = control
-        self.arming = Arming(requested)
-        self.take_down = take_down
-        self.highest_voltage = max((level for action in actions for level in action.voltage), default=0.0)
+        highest = max((level for action in actions for level in action.voltage), default=0.0)
+        arming = Arming(requested)
+        self.rig = Rig(bench, self.recorder, self.limits, gains, control, arming, highest, take_down)
         self._actions = actions
         self._progress = progress
         self._certificates = certificates or {}
-        self.guard: AnyGuard | None = None
         self._guard_process = guard_process
         self._host = HostTime(self.clock)
         self._beats = 0
@@ -160,69 +115,10 @@ class Engine:
         self._next_progress = 0.0
         self._doing = ""
 
-    # What actions may do -------------------------------------------------------------------------------------
-
-    def command(self, device: str, command: str, argument: str) -> None:
-        """Write a command to the log before it is given, its numbers in full: `rig.replay` gives it again."""
-        self.recorder.command(device, command, argument)
-
-    def move_stage(self, position: float, speed: float) -> None:
-        """Move the stage to ``position`` metres of its own scale."""
-        self.limits.speed.check(speed, "Stage speed")
-        self.recorder.speed = speed
-        self.command("stage", "move_to", f"{float(position)!r} m at {speed!r} m/s")
-        self.bench.stage.move_to(position, speed)
-
-    def move_to(self, h: float, speed: float) -> None:
-        """Move the disk to displacement ``h`` metres, with the film checked along the way when there is HV."""
-        self.limits.displacement.check(h, "Displacement set-point")
-        voltage = 0.0
-        if self.guard is not None:
-            voltage = self.guard.setpoint
-            self.guard.check_move(self.recorder.displacement, h)
-        self.recorder.target(h, voltage, speed)
-        self.move_stage(self.recorder.contact + h, speed)
-
-    def stop_stage(self) -> None:
-        """Decelerate to a standstill."""
-        self.command("stage", "stop", "")
-        self.bench.stage.stop()
-
-    def request_voltage(self, volts: float) -> None:
-        """Ask the guard for a voltage at the displacement where the film is; a guard that is SAFE is armed for it.
-
-        Before contact the disk lies where the flat film holds it, at zero.
-        """
-        if self.guard is None:
-            raise FaultError(f"{volts:g} V asked for, but the scene has no HV.")
-        if self.guard.state is GuardState.SAFE:
-            self.arming.check(volts)
-            self.event("hv", f"armed by two acts: {self.arming.requested}; {self.arming.confirmed}")
-            self.guard.arm()
-        h = self.recorder.displacement if math.isfinite(self.recorder.contact) else 0.0
-        self.recorder.target(h, volts, 0.0)
-        self.guard.request(volts, h)
-
-    def event(self, source: str, message: str) -> None:
-        """Write to the log what a reader of it should know."""
-        self.recorder.event("info", source, message)
-
-    def learn(self, role: str, readings: Sequence[float]) -> None:
-        """Let the watch learn the noise of an unloaded sensor."""
-        if self._watch is not None and readings:
-            self._watch.learn(role, readings)
-
-    def ask(self, question: Question) -> Generator[None, None, Answer]:
-        """Ask the operator and yield until he has answered; question and answer go into the log."""
-        self.event("operator", f"asked: {question.text}")
-        self.control.put(question)
-        try:
-            while (answer := self.control.answer) is None:
-                yield
-        finally:
-            self.control.withdraw()
-        self.event("operator", f"answered: {answer}")
-        return answer
+    @property
+    def guard(self) -> AnyGuard | None:
+        """Who commands the supply; None where the scene has none, or before it is appointed."""
+        return self.rig.guard
 
     # The run -------------------------------------------------------------------------------------------------
 
@@ -235,8 +131,9 @@ class Engine:
             self._appoint_guard()
             self._set_up()
             self._watch = Watch(self.bench, self.recorder, self.limits, self.guard)
-            if self.highest_voltage > 0 and not self._hands_come_first():
-                self._take_turns(confirm_voltage(self))
+            self.rig.on_readings = self._watch.learn
+            if self.rig.highest_voltage > 0 and not self._hands_come_first():
+                self._take_turns(confirm_voltage(self.rig))
             self._carry_out_all()
         except Stopped as caught:
             status, error = "stopped", caught
@@ -268,7 +165,7 @@ class Engine:
     def _hands_come_first(self) -> bool:
         """Whether somebody may touch the rig before there is voltage: then it is confirmed after that."""
         for action in self._actions:
-            if action.kind in HANDS:
+            if action.by.hands:
                 return True
             if max(action.voltage) > 0:
                 return False
@@ -289,11 +186,11 @@ class Engine:
         fresh = {role: allowed[role] + heartbeat.MARGIN_S for role in heartbeat.ROLES if role in allowed}
         if process is not None:
             process.appoint(self.gains.voltage, fresh, tell, event)
-            self.guard = process
+            self.rig.guard = process
         else:
             assert self.bench.hv is not None
             film = FilmLimits(scene.specimen.specimen(), self.limits)
-            self.guard = Guard(self.bench.hv, self.limits, film, scene.hv.ramp_V_per_s, tell, fresh)
+            self.rig.guard = Guard(self.bench.hv, self.limits, film, scene.hv.ramp_V_per_s, tell, fresh)
         if not scene.hv.measures_current:
             self.recorder.event("warning", "hv", "this supply does not measure its current: nothing watches it")
 
@@ -320,10 +217,10 @@ class Engine:
 
     def _check_devices(self) -> None:
         """What the plan needs and these devices cannot do is refused while nothing has moved."""
-        if self.guard is not None and self.highest_voltage > 0:
-            self.guard.check_supply(self.highest_voltage)
+        if self.guard is not None and self.rig.highest_voltage > 0:
+            self.guard.check_supply(self.rig.highest_voltage)
         start = self.bench.scene.stage.approach_from_mm * 1e-3
-        if any(action.kind == "approach" for action in self._actions):
+        if any(action.by.finds_contact for action in self._actions):
             travel = Limit("stage position", *self.bench.stage.travel, "mm", 1e3)
             travel.check(start, "stage.approach_from_mm, for this stage")
             ends = [end for action in self._actions for end in action.h]
@@ -354,7 +251,7 @@ class Engine:
         end = self.clock.now() + OUTPUT_LIMIT_S
         while not guard.output_is_safe and self.clock.now() < end:
             self._turn()
-        self._take_turns(choose_about_live_output(self))
+        self._take_turns(choose_about_live_output(self.rig))
         guard.check_off()
 
     def _carry_out_all(self) -> None:
@@ -369,9 +266,17 @@ class Engine:
     def _carry_out(self, action: Action, done: float, total: float) -> bool:
         """Whether the action came to its end; False when the operator wants a pause."""
         began = self.clock.now()
-        self._phase(action, action.kind, action.label, action.voltage[1], record=action.record)
+        write_phase(
+            self.rig,
+            action,
+            action.kind,
+            action.label,
+            direction=action.direction,
+            cycle=action.cycle,
+            record=action.record,
+        )
         label = self._doing = self.control.doing = f"step {action.step} {action.kind}: {action.label}"
-        with closing(carry_out(self, action)) as turns:
+        with closing(action.carry_out(self.rig)) as turns:
             for _ in turns:
                 self._show_now_and_then(done + min(self.clock.now() - began, action.duration), total, label)
                 self._turn()
@@ -381,9 +286,10 @@ class Engine:
 
     def _pause(self, action: Action, done: float, total: float) -> None:
         """Stage standing, voltage down; once the operator continues, back to where the action begins."""
-        self.event("operator", f"paused by {self.control.pausing} during {self._doing}")
-        self._phase(action, "pause", "the operator's pause", 0.0, record=False)
-        with closing(rest(self, action)) as turns:
+        self.rig.event("operator", f"paused by {self.control.pausing} during {self._doing}")
+        words = "the operator's pause"
+        write_phase(self.rig, action, "pause", words, direction=action.direction, cycle=action.cycle, voltage=0.0)
+        with closing(pause(self.rig, action)) as turns:
             for _ in turns:
                 self._show_now_and_then(done, total, f"paused: {self._doing}")
                 self._turn()
@@ -392,19 +298,6 @@ class Engine:
         with closing(turns):
             for _ in turns:
                 self._turn()
-
-    def _phase(self, action: Action, kind: str, label: str, voltage: float, *, record: bool) -> None:
-        self.recorder.phase(
-            {
-                "step": action.step,
-                "kind": kind,
-                "label": label,
-                "cycle": action.cycle,
-                "direction": action.direction,
-                "voltage_V": voltage,
-                "record": record,
-            }
-        )
 
     def _show_now_and_then(self, done: float, total: float, label: str) -> None:
         if self.clock.now() >= self._next_progress:
@@ -463,8 +356,8 @@ class Engine:
             self.guard.on_sample(sample)
         if self._watch is not None:
             self._watch.sample(role, sample, now)
-        if self.listener is not None:
-            self.listener(sample)
+        if self.rig.listener is not None:
+            self.rig.listener(sample)
 
     def _outcome(self, status: str, reason: str, rest: Rest) -> Outcome:
         recorder = self.recorder

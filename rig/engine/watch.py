@@ -14,7 +14,7 @@ from rig.base.errors import FaultError, StaleData
 from rig.bench.bench import Bench
 from rig.log.recorder import Recorder
 from rig.safety.guard import SAFE_VOLTAGE, AnyGuard, GuardState, flag_names
-from rig.safety.limits import Limits
+from rig.safety.limits import ZERO_PART, Limits
 
 # Fresh data or stop. A device may miss two of its periods and take its time-out more (`timeout_s` in the scene: what
 # its wire and the host may delay one answer; one lost answer is asked again after it). A turn of the loop that took
@@ -29,10 +29,6 @@ STUCK_M = 20e-6  # a stage that should have moved this far while it said that it
 DISAGREEMENT_M = 0.5e-3  # between laser and stage, besides what the stage moves in DISAGREEMENT_LAG_S ...
 DISAGREEMENT_LAG_S = 0.05
 DISAGREEMENT_S = 0.25  # ... and for longer than this: one of the two is frozen, or the pusher has slipped
-# An unloaded sensor may be off by this part of the force limit from its stored zero: beyond it something is wrong with
-# it. Where a zero is stored the limit holds against it at all times, so that no zero step can carry the limit away;
-# where none is, it holds against the bare reading with this allowance.
-ZERO_PART = 0.25
 
 
 class Watch:
@@ -161,17 +157,6 @@ class Watch:
                 f"stage and laser disagree: {by_stage * 1e3:.2f} against {recorder.displacement * 1e3:.2f} mm. "
                 "One of them is frozen, or the pusher has slipped."
             )
-
-
-def check_zero(limits: Limits, force_at_zero: float) -> None:
-    """Refuse a zero of the force sensor so far from its stored zero (N) that something must be wrong with it.
-
-    Raises
-    ------
-    LimitError
-        Naming what was found and what is allowed.
-    """
-    limits.force.widened(ZERO_PART).check(force_at_zero, "Zero of the force sensor, unloaded, against the stored zero")
 
 
 def allowed_silence(bench: Bench) -> dict[str, float]:

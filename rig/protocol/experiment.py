@@ -8,11 +8,12 @@ from pathlib import Path
 from calibration.sensors.certificate import Certificate
 from rig.base.certificates import load_certificate
 from rig.base.errors import ConfigError, LimitError
-from rig.calibrate.steps import CALIBRATION
 from rig.log.recorder import Gains
-from rig.protocol.plan import Action, Prediction, check_plan, plan
+from rig.protocol.plan import plan
+from rig.protocol.predict import Prediction, check_plan
 from rig.protocol.protocol import Protocol, load_protocol
 from rig.scene.scene import Scene, load_scene
+from rig.steps.base import Action
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def certificates_of(scene: Scene, folder: Path) -> dict[str, Certificate]:
 def _check_ranges(certificates: dict[str, Certificate], actions: list[Action], predictions: list[Prediction]) -> None:
     """Nothing is planned where a sensor is not calibrated. Calibrations themselves go further."""
     for action, prediction in zip(actions, predictions, strict=True):
-        if action.kind in CALIBRATION:
+        if action.by.calibrates:
             continue
         for role, value, unit in (("force", prediction.peak_force, "N"), ("hv", max(action.voltage), "V")):
             used = certificates.get(role)

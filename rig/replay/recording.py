@@ -17,10 +17,10 @@ from rig.log.contents import ON_PORTS, certificates_in
 from rig.log.errors import LogError
 from rig.log.reader import Log, read_log
 from rig.protocol.experiment import Experiment
-from rig.protocol.plan import Action, plan
+from rig.protocol.plan import plan, plan_resumed
 from rig.protocol.protocol import Protocol
-from rig.run.resume import actions_from
 from rig.scene.scene import Scene
+from rig.steps.base import Action
 
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
@@ -91,7 +91,7 @@ class Recording:
             still_valid = {int(step) for step in resumed.get("preconditioning_still_valid", "").split()}
         except (KeyError, ValueError):
             raise LogError(self.log.path, "does not say at which step it was resumed") from None
-        return actions_from(protocol, scene, first, still_valid, "Is all as the other run left it?")
+        return plan_resumed(protocol, scene, first, still_valid, "Is all as the other run left it?")
 
     @cached_property
     def certificates(self) -> dict[str, Certificate]:

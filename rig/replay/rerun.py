@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rig.bench.bench import Bench
 from rig.bench.opening import open_memory
-from rig.engine.engine import Engine, Outcome
+from rig.engine.engine import Engine
+from rig.engine.outcome import Outcome
 from rig.operator.control import Answer, Control, Question
 from rig.protocol.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench

@@ -9,7 +9,7 @@ sensor's zero must still be near the one taken then.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,9 @@ from rig.base.errors import ConfigError
 from rig.base.toml_file import parse_table, validate
 from rig.log.contents import certificates_in, identities_in
 from rig.log.reader import Log, read_log
-from rig.protocol import protocol as steps
 from rig.protocol.experiment import Experiment
-from rig.protocol.plan import Action, check_plan, plan, plan_from
+from rig.protocol.plan import plan, plan_resumed
+from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import Scene
 
@@ -62,7 +62,7 @@ def prepare_resumed(
         f"Going on at step {first} of {len(protocol.step)}. Is specimen {scene.specimen.name} still mounted as the run "
         f"of {ended} left it, and nothing in the way of the stage, which finds its reference position first?"
     )
-    actions = actions_from(protocol, scene, first, still_valid, question)
+    actions = plan_resumed(protocol, scene, first, still_valid, question)
     plan(protocol, scene)  # what is left must belong to a protocol that can be carried out
     return Experiment(
         scene,
@@ -81,13 +81,6 @@ def prepare_resumed(
         },
         stored_zero=_force_zero(log),
     )
-
-
-def actions_from(
-    protocol: Protocol, scene: Scene, first: int, still_valid: Collection[int], question: str
-) -> list[Action]:
-    """What a resumed run does: the question whether all is as it was, and the rest of the protocol."""
-    return [Action(first, "prompt", question, (0, 0), (0, 0), 0.0), *plan_from(protocol, scene, first, still_valid)]
 
 
 def _text(log: Log, name: str) -> str:
@@ -123,14 +116,12 @@ def _next_step(log: Log) -> int:
 
 
 def _still_valid(log: Log, protocol: Protocol, first: int, now_ns: int) -> set[int]:
-    """Preconditioning steps that were completed so recently that they need not be done again."""
+    """Steps that were completed so recently that they need not be done again."""
     phases = sorted(log.messages("/phase"), key=lambda message: message.log_ns)
     found = set()
     for number, step in enumerate(protocol.step[: first - 1], start=1):
-        if not isinstance(step, steps.Precondition):
-            continue
         later = [message.log_ns for message in phases if message.fields["step"] > number]
-        if later and 0 <= now_ns - later[0] <= step.valid_for_min * 60e9:
+        if later and 0 <= now_ns - later[0] <= step.valid_for_s * 1e9:
             found.add(number)
     return found
 

@@ -16,7 +16,8 @@ from pathlib import Path
 from calibration.sensors.certificate import Certificate
 from rig.base.clock import Clock, calendar_now
 from rig.base.errors import FaultError
-from rig.engine.engine import Engine, Outcome
+from rig.engine.engine import Engine
+from rig.engine.outcome import Outcome
 from rig.log import space
 from rig.log.contents import IN_MEMORY, ON_PORTS
 from rig.log.process import LogProcess

@@ -15,6 +15,10 @@ MONITOR_V = 50.0
 MONITOR_GAIN = 1.03
 # So little raised a film is flat to eight digits, and solved in a tenth of the time that the exactly flat one takes.
 FLAT_M = 1e-6
+# An unloaded sensor may be off by this part of the force limit from its stored zero: beyond it something is wrong with
+# it. Where a zero is stored the limit holds against it at all times, so that no zero step can carry the limit away;
+# where none is, it holds against the bare reading with this allowance.
+ZERO_PART = 0.25
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,17 @@ class Limits:
             leakage=table.leakage_uA * 1e-6,
             parallel_capacitance=scene.hv.parallel_capacitance_nF * 1e-9 if scene.hv is not None else 0.0,
         )
+
+
+def check_zero(limits: Limits, force_at_zero: float) -> None:
+    """Refuse a zero of the force sensor so far from its stored zero (N) that something must be wrong with it.
+
+    Raises
+    ------
+    LimitError
+        Naming what was found and what is allowed.
+    """
+    limits.force.widened(ZERO_PART).check(force_at_zero, "Zero of the force sensor, unloaded, against the stored zero")
 
 
 class FilmLimits:

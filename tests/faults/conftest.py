@@ -14,12 +14,14 @@ from drivers.links.link import DeviceError
 from rig.base.certificates import load_certificate
 from rig.base.errors import RigError
 from rig.base.toml_file import parse_table
-from rig.engine.engine import Engine, Outcome
+from rig.engine.engine import Engine
+from rig.engine.outcome import Outcome
 from rig.log.reader import read_log
 from rig.log.recorder import Gains
 from rig.log.writer import LogWriter
 from rig.operator.control import Control
-from rig.protocol.plan import check_plan, plan
+from rig.protocol.plan import plan
+from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
 from rig.run.backend import open_bench
 from rig.scene.scene import Scene

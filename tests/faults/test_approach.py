@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from drivers.links.link import DeviceSilent
-from rig import actions
 from rig.base.clock import VirtualClock
 from rig.base.errors import FaultError, StaleData
 from rig.log.reader import read_log
@@ -96,7 +95,7 @@ def test_legs_find_contact_where_one_motion_does_and_as_soon(
     ways.clear()
     legs.log.unlink()
 
-    monkeypatch.setattr(actions, "LEG_S", 1e9)  # one motion for the whole way
+    monkeypatch.setattr("rig.steps.approach.LEG_S", 1e9)  # one motion for the whole way
     one = tell(scene=scene, protocol=PROTOCOL)
     assert furthest_ahead(ways) > 7e-3
     assert one.stage_words.count("move_to") == 3

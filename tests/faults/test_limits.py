@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from drivers.roles import ForceSample
 from rig.base.errors import FaultError, LimitError, StaleData
 from rig.base.toml_file import parse_table
-from rig.engine.watch import FROZEN_FEWEST, Watch, check_zero
+from rig.engine.watch import FROZEN_FEWEST, Watch
 from rig.log.reader import read_log
 from rig.log.recorder import Gains, Recorder
 from rig.operator.control import Control
 from rig.run.backend import open_bench
-from rig.safety.limits import Limits
+from rig.safety.limits import Limits, check_zero
 from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.truth import Fault

@@ -131,7 +131,7 @@ class Alone:
         self.truth, self.clock = self.bench.simulated, self.bench.clock
         ours, theirs = socket.socketpair()
         self.engine, self._theirs = Channel(ours), Channel(theirs)
-        link = self.bench._frame_links["hv"]
+        link = self.bench._opened.links["hv"]
         self.server = Server(scene, scene.hv, link, self._theirs, self.clock)  # type: ignore[arg-type]
         self._beats = self._calls = 0
         self.engine.send({"do": "appoint", "gain": 1.0, "fresh": {}})

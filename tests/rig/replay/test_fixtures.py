@@ -109,13 +109,13 @@ def test_every_command_of_the_software_can_be_given_again():
     import re
     from inspect import getsource
 
-    from rig import actions
     from rig.engine import engine
     from rig.replay.verify import commands
     from rig.safety import guard
+    from rig.steps import home, rig
 
     written = {("hv", word) for word in re.findall(r'_tell\("(\w+)"', getsource(guard))}
-    for module in (actions, engine):
+    for module in (home, rig, engine):
         written |= set(re.findall(r'\.command\("(\w+)", "(\w+)"', getsource(module)))
     assert len(written) >= 10
     assert written <= commands(None).keys()

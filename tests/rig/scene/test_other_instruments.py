@@ -18,7 +18,8 @@ from drivers.links.link import DeviceError
 from model.membrane.solve import solve_many
 from rig.base.certificates import load_certificate
 from rig.base.errors import ConfigError, RigError, Stopped
-from rig.engine.engine import Engine, Outcome
+from rig.engine.engine import Engine
+from rig.engine.outcome import Outcome
 from rig.log.dataset import Run, load_run
 from rig.log.export import export
 from rig.log.info import info

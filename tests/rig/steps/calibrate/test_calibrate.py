@@ -21,13 +21,14 @@ from rig.analysis.sensors import Calibration, Lag, calibrate
 from rig.base.certificates import load_certificate
 from rig.base.errors import DataError, LimitError
 from rig.base.toml_file import load_table, parse_table
-from rig.calibrate.plan import series
 from rig.cli.app import main
 from rig.cli.calibrate import calibration_table
 from rig.log.reader import read_log
-from rig.protocol.plan import check_plan, plan
+from rig.protocol.plan import plan
+from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import load_scene
+from rig.steps.standards import series
 
 FIXTURES = Path(str(files("sim_fixtures")))
 TRUTH = {

@@ -13,12 +13,12 @@ from rig.analysis.fit_file import read_fit
 from rig.analysis.strokes import strokes
 from rig.base.errors import FaultError, LimitError
 from rig.cli.app import main
-from rig.follow.plan import rest_from
 from rig.log.dataset import load_run
 from rig.log.reader import read_log
 from rig.protocol.experiment import prepare
 from rig.run.run import run
 from rig.scene.scene import load_scene
+from rig.steps.follow import rest_from
 
 
 def nobody(done, total, label):
@@ -140,7 +140,7 @@ def test_it_must_begin_in_contact(tmp_path, write_bench):
     follow = protocol.read_text().index('[[step]]\ndo = "follow"')
     text = protocol.read_text()
     protocol.write_text(text[:approach] + text[follow:])
-    with pytest.raises(LimitError, match="in contact"):
+    with pytest.raises(LimitError, match="needs the contact position"):
         prepare(scene, protocol)
 
 

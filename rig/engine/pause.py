@@ -1,0 +1,33 @@
+"""The operator's pause in the midst of an action."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+from rig.steps.base import Action, Turns
+from rig.steps.output import take_down
+from rig.steps.regain import regain
+from rig.steps.rig import Rig
+from rig.steps.turns import halt
+
+
+def pause(rig: Rig, action: Action) -> Turns:
+    """Stage standing, voltage measured off, until the operator continues; then back to where ``action`` begins.
+
+    He may ask for another pause on the way back.
+    """
+    while True:
+        yield from halt(rig)
+        yield from take_down(rig, "the operator's pause")
+        rig.control.say("Paused: the stage stands" + (", the voltage is off." if rig.guard is not None else "."))
+        while rig.control.pausing:
+            yield
+        rig.event("operator", "continues")
+        with closing(regain(rig, action)) as turns:
+            for _ in turns:
+                yield
+                if rig.control.pausing:
+                    rig.event("operator", f"paused again by {rig.control.pausing}")
+                    break
+            else:
+                return
