@@ -40,19 +40,16 @@ def register(law: type[Law]) -> type[Law]:
 
 
 @cache
-def _installed() -> None:
-    """Register the laws of other packages.
-
-    Raises
-    ------
-    ValueError : one of them cannot be used; the message names its package
-    """
+def _installed() -> tuple[str, ...]:
+    """Register the laws of other packages; what is wrong with those that cannot be used, in words."""
+    broken = []
     for point in entry_points(group=GROUP):
         try:
             register(point.load())
-        except Exception as error:  # whatever a foreign module raises while it is imported
+        except Exception as error:  # whatever a package raises must not stop a run that does not need it
             package = point.dist.name if point.dist else point.value
-            raise ValueError(f"the law {point.name!r} of the package {package} cannot be used: {error}") from error
+            broken.append(f"Package {package} registers the law {point.name!r}, but cannot be used: {error!r}.")
+    return tuple(broken)
 
 
 def known_laws() -> dict[str, type[Law]]:
@@ -66,10 +63,11 @@ def find_law(name: str) -> type[Law]:
 
     Raises
     ------
-    ValueError : there is none; the message lists those there are
+    ValueError : there is none; the message lists those there are, and packages that could not be used
     """
+    if name in _LAWS:
+        return _LAWS[name]
+    broken = "".join(f". {text}" for text in _installed())
     if name not in _LAWS:
-        _installed()
-    if name not in _LAWS:
-        raise ValueError(f"law {name!r} is not known; known are {', '.join(_LAWS)}")
+        raise ValueError(f"law {name!r} is not known; known are {', '.join(_LAWS)}{broken}")
     return _LAWS[name]

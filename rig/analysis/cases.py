@@ -8,7 +8,9 @@ from typing import Any, cast
 
 import numpy as np
 
+from model.material.laws import find_law
 from model.material.materials import Material
+from model.material.ogden import Ogden
 from model.membrane.solve import Solutions, Status, Wrinkling, solve_many
 from model.specimen import Specimen
 
@@ -37,10 +39,11 @@ def solve_cases(cases: Any) -> list[dict[str, Any]]:
     """Solve a list of cases; the answers stand in the same order.
 
     A case is an object with, in SI units, ``id, a, b, thickness, prestretch, h, voltage, wrinkling`` ("plain" or
-    "tension_field"), ``material {mu: [...], alpha: [...], eps_r}`` and optionally ``tolerance`` (relative, of the
-    force); ``voltage`` 0, ``wrinkling`` "plain" and ``tolerance`` 1e-8 when left out. An answer has ``id, status, F,
-    error_estimate, peak_field, min_hoop_stress, max_stretch, iterations``, the numbers None when there is no answer,
-    and then a ``message``. A bad case gets the status "invalid" and does not touch its neighbours.
+    "tension_field"), ``material {mu: [...], alpha: [...], eps_r}``, or of another law with the names of its parameters
+    ``material {law: "gent", mu, Jm, eps_r}``, and optionally ``tolerance`` (relative, of the force); ``voltage`` 0,
+    ``wrinkling`` "plain" and ``tolerance`` 1e-8 when left out. An answer has ``id, status, F, error_estimate,
+    peak_field, min_hoop_stress, max_stretch, iterations``, the numbers None when there is no answer, and then a
+    ``message``. A bad case gets the status "invalid" and does not touch its neighbours.
 
     Raises
     ------
@@ -98,7 +101,7 @@ def read_case(raw: Any) -> Case:
     CaseError, ValueError : the case does not describe a film
     """
     table = _table(raw, "the case", KEYS, ("id", *NUMBERS, "material"))
-    material = _table(table["material"], "material", ("mu", "alpha", "eps_r"), ("mu", "alpha", "eps_r"))
+    material = _material(table["material"])
     wrinkling = table.get("wrinkling", "plain")
     if wrinkling not in WRINKLING:
         raise CaseError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
@@ -111,14 +114,24 @@ def read_case(raw: Any) -> Case:
         ring_radius=values["b"],
         thickness=values["thickness"],
         prestretch=values["prestretch"],
-        material=Material(
-            name="case",
-            mu=_list(material["mu"], "material.mu"),
-            alpha=_list(material["alpha"], "material.alpha"),
-            eps_r=_number(material["eps_r"], "material.eps_r"),
-        ),
+        material=material,
     )
     return Case(film, values["h"], values["voltage"], values["tolerance"], cast(Wrinkling, wrinkling))
+
+
+def _material(raw: Any) -> Material:
+    """The film: a law, Ogden's when none is named, its parameters by their names, and the permittivity."""
+    name = raw.get("law", Ogden.name) if isinstance(raw, dict) else Ogden.name
+    if not isinstance(name, str):
+        raise CaseError(f"material.law must be the name of a law, not {_kind(name)}")
+    law = find_law(name)
+    names = tuple(p.name for p in law.parameters(*law.counts(1)))
+    table = _table(raw, "material", ("law", *names, "eps_r"), (*names, "eps_r"))
+    values = {
+        key: _list(table[key], f"material.{key}") if law.series else _number(table[key], f"material.{key}")
+        for key in names
+    }
+    return Material.with_law("case", law, values, _number(table["eps_r"], "material.eps_r"))
 
 
 def _kind(value: Any) -> str:

@@ -277,15 +277,6 @@ def _truth(runs: Sequence[Run], scenes: Sequence[Scene]) -> Material | None:
     for scene in scenes:
         if scene.simulation is None:
             return None
-        film, believed = scene.simulation.film, scene.specimen.specimen().material
-        truths.add(
-            (
-                tuple(film.mu_Pa) if film.mu_Pa is not None else believed.mu,
-                tuple(film.alpha) if film.alpha is not None else believed.alpha,
-                film.eps_r if film.eps_r is not None else believed.eps_r,
-            )
-        )
-    if len(truths) != 1:
-        return None
-    mu, alpha, eps_r = truths.pop()
-    return Material(name="the simulation's truth", mu=mu, alpha=alpha, eps_r=eps_r)
+        film = scene.simulation.film.material(scene.specimen.specimen().material)
+        truths.add(Material("the simulation's truth", film.mu, film.alpha, film.eps_r, law=film.law))
+    return truths.pop() if len(truths) == 1 else None

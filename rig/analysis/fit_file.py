@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from model.material.laws import find_law
 from model.material.materials import Material
+from model.material.ogden import Ogden
 from rig.base.errors import ConfigError
 from rig.base.json_text import parse_json
 from rig.base.text_file import read_text
@@ -38,14 +40,17 @@ def read_fit(path: Path, believed: Material) -> FittedFilm:
         covariance = np.array(fit["covariance"], dtype=float)
         if covariance.shape != (len(names), len(names)) or not np.isfinite(covariance).all():
             raise ValueError("its covariance is not complete")
-        terms = range(1, int(fit["terms"]) + 1)
+        law = find_law(str(fit.get("law", Ogden.name)))
+        moduli, shapes = law.counts(int(fit["terms"]))
+        numbers = [values[name] for name in law.names(moduli, shapes)]
         material = replace(
             believed,
             name=f"identified ({path.name})",
-            mu=tuple(values[f"mu{k}"] for k in terms),
-            alpha=tuple(values[f"alpha{k}"] for k in terms),
+            mu=tuple(numbers[:moduli]),
+            alpha=tuple(numbers[moduli:]),
             eps_r=values.get("eps_r", believed.eps_r),
             source=str(path),
+            law=law,
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not a usable result of `dea-rig fit -o`: {error!r}.") from None

@@ -18,7 +18,7 @@ from rig.base.table import Table
 from rig.base.text_file import read_text
 from rig.base.toml_file import validate
 from rig.base.toml_text import parse_toml
-from rig.scene.specimen import MaterialTable
+from rig.scene.specimen import AnyMaterial
 
 Positive = Annotated[float, Field(gt=0)]
 Stretch = Annotated[float, Field(ge=1.0, le=6.0)]
@@ -32,7 +32,7 @@ class FilmTable(Table):
 
     ring_radius_mm: Positive = 20.0
     thickness_um: Positive = 40.0
-    material: str | MaterialTable = "parker-cao2018"
+    material: AnyMaterial = "parker-cao2018"
 
     @model_validator(mode="after")
     def _known(self) -> Self:

@@ -2,46 +2,49 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from pydantic import Field, model_validator
 
 from drivers.settings import NotNegative, Positive
 from model.material.materials import NAMED, Material
 from model.specimen import Specimen
+from rig.base.law_tables import any_law, law_values
 from rig.base.table import Table
 from rig.base.unusual import slip_of
 
 
 class MaterialTable(Table):
-    """Ogden terms in the convention W = sum mu_n/alpha_n (l1^a + l2^a + (l1 l2)^-a - 3), and the permittivity."""
+    """What is believed of the film; the parameters of its law are further keys, made from `model.material.laws`."""
 
-    mu_Pa: list[float] = Field(min_length=1, max_length=6)
-    alpha: list[float] = Field(min_length=1, max_length=6)
-    eps_r: float = Field(default=1.0, ge=1.0)
-    breakdown_V_per_um: Positive | None = None
-    max_stretch: float | None = Field(default=None, gt=1.0)
-    source: str = ""
+    eps_r: float = Field(default=1.0, ge=1.0, description="Relative permittivity. Typical: 2 to 8; default 1.")
+    breakdown_V_per_um: Positive | None = Field(
+        default=None,
+        description="True field at which the film breaks down (V/um). Typical: 30 to 200. Absent: unknown.",
+    )
+    max_stretch: float | None = Field(
+        default=None, gt=1.0, description="Largest stretch the film stands, pre-stretch included. Absent: unknown."
+    )
+    source: str = Field(default="", description="Where the numbers come from, for reports.")
 
     @model_validator(mode="after")
-    def _same_length(self) -> Self:
-        if len(self.mu_Pa) != len(self.alpha):
-            raise ValueError(f"mu_Pa has {len(self.mu_Pa)} terms and alpha {len(self.alpha)}; they must pair up")
-        self.material("here")  # whatever else the model refuses
+    def _is_a_film(self) -> Self:
+        self.material("here")  # whatever the model refuses
         return self
 
     def material(self, name: str) -> Material:
         """The same in SI units."""
+        law, values = law_values(self)
         field = None if self.breakdown_V_per_um is None else self.breakdown_V_per_um * 1e6
-        return Material(
-            name=name,
-            mu=tuple(self.mu_Pa),
-            alpha=tuple(self.alpha),
-            eps_r=self.eps_r,
-            breakdown_field=field,
-            max_stretch=self.max_stretch,
-            source=self.source,
+        return Material.with_law(
+            name, law, values, self.eps_r, breakdown_field=field, max_stretch=self.max_stretch, source=self.source
         )
+
+
+if TYPE_CHECKING:
+    AnyMaterial = str | MaterialTable
+else:
+    AnyMaterial = any_law(MaterialTable, str)
 
 
 class SpecimenTable(Table):
@@ -69,7 +72,7 @@ class SpecimenTable(Table):
         description="Equibiaxial pre-stretch, stretched over original length; 1 is none. Typical: 1.05 to 4.",
         json_schema_extra={"usual": [1, 6]},
     )
-    material: str | MaterialTable = Field(
+    material: AnyMaterial = Field(
         description="What is believed of the film: the name of a known material, or a table [specimen.material]."
     )
     disk_radius_uncertainty_mm: NotNegative = Field(

@@ -7,10 +7,14 @@ own keys and its own faults. Every key has a default, so that ``seed = 1`` is a 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal, Self
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from model.material.materials import Material
+from model.material.ogden import Ogden
+from rig.base.law_tables import any_law, law_table, law_values
 from rig.base.table import Table
 from rig.sim.wire import ByteWire, FrameWire
 
@@ -161,12 +165,11 @@ class MaxwellBranch(Table):
 
 
 class FilmTruth(Table):
-    """The film that is really mounted, where it differs from the scene's guess. Ogden, W = sum mu/al (l^al ... - 3)."""
+    """The film that is really mounted, where it differs from the scene's guess.
 
-    mu_Pa: list[float] | None = Field(
-        default=None, description="Ogden coefficients (Pa), one a term. Absent: as in the scene."
-    )
-    alpha: list[float] | None = Field(default=None, description="Ogden exponents, one a term; given with mu_Pa.")
+    The parameters of its law are further keys, all of them or none.
+    """
+
     eps_r: Positive | None = Field(default=None, description="Relative permittivity. Absent: as in the scene.")
     breakdown_field_MV_per_m: Positive | None = Field(
         default=None, description="True field at which the film breaks down (MV/m = V/um). Absent: as in the scene."
@@ -176,12 +179,28 @@ class FilmTruth(Table):
     )
 
     @model_validator(mode="after")
-    def _ogden_terms_pair_up(self) -> Self:
-        if (self.mu_Pa is None) != (self.alpha is None):
-            raise ValueError("mu_Pa and alpha come together")
-        if self.mu_Pa is not None and self.alpha is not None and len(self.mu_Pa) != len(self.alpha):
-            raise ValueError(f"mu_Pa has {len(self.mu_Pa)} terms and alpha has {len(self.alpha)}")
+    def _is_a_film(self) -> Self:
+        self.material(Material("believed", (1e5,), (2.0,), 1.0))
         return self
+
+    def material(self, believed: Material) -> Material:
+        """The film itself; ``believed`` has what is not told here."""
+        law, values = law_values(self)
+        eps_r = believed.eps_r if self.eps_r is None else self.eps_r
+        field = believed.breakdown_field
+        if self.breakdown_field_MV_per_m is not None:
+            field = self.breakdown_field_MV_per_m * 1e6
+        if not values:
+            return replace(believed, eps_r=eps_r, breakdown_field=field)
+        stretch = believed.max_stretch
+        return Material.with_law(believed.name, law, values, eps_r, breakdown_field=field, max_stretch=stretch)
+
+
+if TYPE_CHECKING:
+    AnyFilm = FilmTruth
+else:
+    AnyFilm = any_law(FilmTruth, optional=True)
+OGDEN_FILM = law_table(FilmTruth, Ogden, optional=True)
 
 
 class RigTruth(Table):
@@ -198,4 +217,4 @@ class RigTruth(Table):
     rig_compliance_um_per_N: NotNegative = Field(
         default=2.0, description="How far the rig gives way (um/N). Typical: 1 to 20."
     )
-    film: FilmTruth = Field(default=FilmTruth(), description="The film that is really mounted.")
+    film: AnyFilm = Field(default=OGDEN_FILM(), description="The film that is really mounted.")

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from model.material.materials import Material
 from model.specimen import Specimen
 from rig.sim.film import FilmTable, Solve, solve_membrane, tabulate
 from rig.sim.path import Path
@@ -25,18 +24,10 @@ TICK = 0.01  # s; the film's relaxation is integrated, and its strength checked,
 
 def true_specimen(rig: RigTruth, specimen: Specimen) -> Specimen:
     """The specimen with the film that is really mounted."""
-    film, guess = rig.film, specimen.material
-    changes: dict[str, object] = {}
-    if film.mu_Pa is not None and film.alpha is not None:
-        changes |= {"mu": tuple(film.mu_Pa), "alpha": tuple(film.alpha)}
-    if film.eps_r is not None:
-        changes["eps_r"] = film.eps_r
-    if film.breakdown_field_MV_per_m is not None:
-        changes["breakdown_field"] = film.breakdown_field_MV_per_m * 1e6
-    if not changes:
+    material = rig.film.material(specimen.material)
+    if material == specimen.material:
         return specimen
-    material: Material = replace(guess, **changes, name=f"{guess.name} as mounted")  # type: ignore[arg-type]
-    return specimen.with_material(material)
+    return specimen.with_material(replace(material, name=f"{specimen.material.name} as mounted"))
 
 
 class World:
