@@ -15,6 +15,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from drivers.links.can_link import SHARED
+from drivers.registry import of_role, registered
 from drivers.settings import CanSettings, InstrumentSettings, Positive
 from rig.base.errors import ConfigError
 from rig.base.table import Table
@@ -24,6 +25,7 @@ from rig.scene.specimen import SpecimenTable
 from rig.sim.settings import SimulationSettings
 from rig.sim.truth import ROLES
 from rig.sim.twins import of_role as twins_of_role
+from rig.sim.twins import registered as registered_twins
 
 
 class LimitsTable(Table):
@@ -104,6 +106,17 @@ class Scene(Table):
         default=None, description="The simulated bench: the truth behind film and instruments, and their faults."
     )
     bench: BenchTable | None = Field(default=None, description="A log in place of all instruments.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _registered(cls, raw: Any) -> Any:
+        """A driver of a package that cannot be used: why, rather than that there is none of this name."""
+        broken = [*registered().broken, *registered_twins().broken]
+        for role in ROLES if broken and isinstance(raw, dict) else ():
+            table = raw.get(role)
+            if isinstance(table, dict) and table.get("driver") not in of_role(role):
+                raise ValueError(f"{role}.driver = {table.get('driver')!r} is not known. {' '.join(broken)}")
+        return raw
 
     @model_validator(mode="before")
     @classmethod
