@@ -6,22 +6,16 @@ In the plane of the sheet, incompressible and free on its faces, the nominal str
 
 with ``l2 = l1**-0.5`` in a uniaxial test, ``l2 = l1`` in an equibiaxial one and ``l2 = 1`` in pure shear.
 
-A test is a CSV file. Lines that begin with ``#`` are remarks; one of them may say ``# kind: uniaxial`` (or equibiaxial,
-pure shear, biaxial), else the file's name must. Columns are ``stretch, nominal_stress_MPa`` (or ``_kPa``, ``_Pa``), for
-biaxial tests ``stretch1, stretch2, nominal_stress1_MPa, nominal_stress2_MPa``.
-
 Convention of the Ogden terms: `model.material.materials.Material`.
 """
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import warnings as python_warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -33,21 +27,13 @@ Array = NDArray[np.float64]
 
 Weighting = Literal["balanced", "relative"]
 
-KINDS = (
-    "equibiaxial",
-    "biaxial",
-    "uniaxial",
-    "pure shear",
-)  # a name with "equibiaxial" holds "biaxial" too: in this order
-UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
-LARGEST_BYTES = 4 * 1024 * 1024
 SHARE_BOUNDS = (1e-8, 10.0)
 EXPONENT_BOUNDS = (0.05, 30.0)  # of |alpha|
 SAME_MINIMUM = 1.0  # chi-square, in units of the scatter about the best fit, by which minima count as equally good
 
 
 class TestsError(ValueError):
-    """A test that cannot be read or fitted; the message names the file and what is wrong."""
+    """A test that cannot be fitted; the message names it and what is wrong."""
 
     __test__ = False  # not a test class, whatever its name suggests to pytest
 
@@ -119,89 +105,6 @@ class TestsFit:
     def to_json(self) -> str:
         """`to_dict` as JSON text."""
         return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
-
-
-def load_test(path: Path) -> HomogeneousTest:
-    """Read one CSV file; see the module's docstring for its form. Raises `TestsError`."""
-    try:
-        with path.open("rb") as file:
-            raw = file.read(LARGEST_BYTES + 1)
-    except OSError as error:
-        raise TestsError(f"{path}: cannot read the test: {error.strerror}") from error
-    if len(raw) > LARGEST_BYTES:
-        raise TestsError(f"{path}: larger than {LARGEST_BYTES // 1024**2} MB; this is no stress-stretch table")
-    try:
-        lines = raw.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise TestsError(f"{path}: not a text file (byte {error.start})") from error
-    kind = _kind(path, [line for line in lines if line.startswith("#")])
-    table = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
-    if len(table) < 3:
-        raise TestsError(f"{path}: a heading and at least two rows are needed, there are {len(table)} rows")
-    for line, row in enumerate(table[1:], start=1):
-        if len(row) != len(table[0]):
-            raise TestsError(
-                f"{path}: row {line} below the heading has {len(row)} values and the heading {len(table[0])}; values "
-                "are separated by commas, and decimals have a point"
-            )
-    columns = _columns(path, [cell.strip() for cell in table[0]], table[1:])
-    if kind == "biaxial":
-        stretch1, stretch2 = columns["stretch1"], columns["stretch2"]
-        stress1, stress2 = columns["nominal_stress1"], columns["nominal_stress2"]
-    else:
-        stretch1, stress1 = columns["stretch"], columns["nominal_stress"]
-        stretch2 = {"uniaxial": stretch1**-0.5, "equibiaxial": stretch1, "pure shear": np.ones_like(stretch1)}[kind]
-        stress2 = np.full_like(stress1, np.nan)
-    return HomogeneousTest(path.stem, kind, stretch1, stretch2, stress1, stress2)
-
-
-def _kind(path: Path, remarks: Sequence[str]) -> str:
-    for remark in remarks:
-        key, _, value = remark.lstrip("# ").partition(":")
-        if key.strip() == "kind":
-            if value.strip() in KINDS:
-                return value.strip()
-            raise TestsError(f"{path}: kind is {value.strip()!r}; allowed are {', '.join(KINDS)}")
-    name = path.stem.lower().replace("_", " ").replace("-", " ")
-    for kind in KINDS:
-        if kind in name:
-            return kind
-    raise TestsError(
-        f"{path}: what kind of test is it? Write '# kind: KIND' the heading, with one of {', '.join(KINDS)}"
-    )
-
-
-def _columns(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Array]:
-    """Columns by name without unit, in SI units."""
-    columns: dict[str, Array] = {}
-    for number, title in enumerate(heading):
-        base, factor = title, 1.0
-        if title.startswith("nominal_stress"):
-            base, _, unit = title.rpartition("_")
-            if unit not in UNITS:
-                raise TestsError(f"{path}: column {title!r} has no unit; allowed are {', '.join(UNITS)}")
-            factor = UNITS[unit]
-        try:
-            column = np.array([float(row[number]) for row in rows])
-        except (ValueError, IndexError) as error:
-            raise TestsError(f"{path}: column {title!r} holds something that is not a number: {error}") from error
-        if not np.isfinite(column).all():
-            raise TestsError(
-                f"{path}: column {title!r} holds a value that is not finite, in row "
-                f"{int(np.flatnonzero(~np.isfinite(column))[0]) + 1} below the heading"
-            )
-        if title.startswith("stretch") and not (column > 0.0).all():
-            raise TestsError(
-                f"{path}: column {title!r} holds a stretch that is not positive; 1 is the unstretched sheet"
-            )
-        columns[base] = column * factor
-    single, double = {"stretch", "nominal_stress"}, {"stretch1", "stretch2", "nominal_stress1", "nominal_stress2"}
-    if set(columns) not in (single, double):
-        raise TestsError(
-            f"{path}: the columns are {', '.join(heading)}; wanted are stretch, nominal_stress_MPa, or for biaxial "
-            "tests stretch1, stretch2, nominal_stress1_MPa, nominal_stress2_MPa, separated by commas"
-        )
-    return columns
 
 
 def nominal_stress(mu: Sequence[float], alpha: Sequence[float], test: HomogeneousTest) -> Array:

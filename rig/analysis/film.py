@@ -15,7 +15,6 @@ from calibration.film.curve import Curve, CurveError
 from calibration.film.identify import IdentificationError, compare, identify
 from calibration.film.result import Identification
 from calibration.sensors.certificate import Certificate
-from calibration.sheet.sheet_tests import TestsError, TestsFit, fit_tests, load_test
 from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
 from rig.base.outputs import write_text
@@ -23,6 +22,7 @@ from rig.base.toml_file import parse_table
 from rig.log.contents import IN_MEMORY
 from rig.log.dataset import CurveErrors, Run, load_run
 from rig.scene.scene import Scene
+from rig.scene.specimen import SpecimenTable
 
 # Of a rig that nobody pressed on (m/N): load cells for a newton give way by some 0.3 mm at full scale.
 UNKNOWN_COMPLIANCE = 3e-4
@@ -47,6 +47,7 @@ class Found:
     truth: Material | None
     notes: list[str]
     comparison: list[Identification] = field(default_factory=list)
+    scene_texts: dict[str, str] = field(default_factory=dict)  # beside those of the runs: scenes given with tables
 
 
 def identify_logs(
@@ -89,12 +90,48 @@ def identify_logs(
             curves += [_with_drift(curve, certificates) for curve in inside]
         if not curves:
             raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
-        options: dict[str, Any] = {
-            "profiles": profiles,
-            "provenance": provenance,
-            "wrinkling": "tension_field" if wrinkled == "tension-field" else "plain",
-            "reach": min(scene.limits.displacement_mm for scene in scenes) * 1e-3,
-        }
+    except CurveError as error:
+        raise DataError(f"{error}.") from None
+    identified = identify_curves(
+        curves,
+        provenance,
+        terms=terms,
+        comparing=comparing,
+        profiles=profiles,
+        wrinkled=wrinkled,
+        posterior=posterior,
+        progress=progress,
+        reach=min(scene.limits.displacement_mm for scene in scenes) * 1e-3,
+    )
+    return replace(identified, runs=runs, truth=_truth(runs, scenes), notes=_notes(runs))
+
+
+def identify_curves(
+    curves: list[Curve],
+    provenance: dict[str, object],
+    *,
+    terms: int = 2,
+    comparing: bool = False,
+    profiles: bool = False,
+    wrinkled: str = "left-out",
+    posterior: bool = False,
+    progress: Callable[[float, float, str], None] = lambda done, total, label: None,
+    reach: float = math.inf,
+) -> Found:
+    """Identify the film from curves, wherever they come from; options as in `identify_logs`.
+
+    Raises
+    ------
+    DataError
+        When the curves cannot be fitted.
+    """
+    options: dict[str, Any] = {
+        "profiles": profiles,
+        "provenance": provenance,
+        "wrinkling": "tension_field" if wrinkled == "tension-field" else "plain",
+        "reach": reach,
+    }
+    try:
         comparison = compare(curves, **options) if comparing else []
         same = [one for one in comparison if one.terms == terms]
         identification = same[0] if same else identify(curves, terms=terms, **options)
@@ -104,7 +141,7 @@ def identify_logs(
             identification = replace(identification, posterior=sample(curves, identification, progress=progress))
     except (CurveError, IdentificationError) as error:
         raise DataError(f"{error}.") from None
-    return Found(identification, curves, runs, provenance, _truth(runs, scenes), _notes(runs), comparison)
+    return Found(identification, curves, [], provenance, None, [], comparison)
 
 
 def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certificate]) -> Curve:
@@ -200,29 +237,13 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
                 report,
                 found.identification,
                 found.curves,
-                scene_texts={str(run.log.path): run.scene for run in found.runs},
+                scene_texts={str(run.log.path): run.scene for run in found.runs} | found.scene_texts,
                 provenance=found.provenance,
                 truth=found.truth,
                 comparison=found.comparison,
             )
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None
-
-
-def identify_tests(tests: Sequence[Path], predict: Sequence[Path], terms: int) -> TestsFit:
-    """Identify Ogden terms from homogeneous tests in CSV files; ``predict`` are held against the result.
-
-    Raises
-    ------
-    DataError
-        When a file cannot be read as a test, or the tests cannot be fitted.
-    """
-    try:
-        return fit_tests(
-            [load_test(path) for path in tests], terms=terms, predict=[load_test(path) for path in predict]
-        )
-    except TestsError as error:
-        raise DataError(f"{error}.") from None
 
 
 def _with_drift(curve: Curve, certificates: Mapping[str, Certificate]) -> Curve:
@@ -243,17 +264,21 @@ def _errors(run: Run, scene: Scene, certificates: Mapping[str, Certificate]) -> 
     return errors_of(scene, certificates)
 
 
+def dimension_errors(dimensions: SpecimenTable) -> CurveErrors:
+    """The uncertainties that a curve has from the dimensions of its specimen."""
+    return {
+        "thickness_uncertainty": dimensions.thickness_uncertainty_um / dimensions.thickness_um,
+        "prestretch_uncertainty": dimensions.prestretch_uncertainty / dimensions.prestretch,
+        "disk_radius_uncertainty": dimensions.disk_radius_uncertainty_mm / dimensions.disk_radius_mm,
+        "eccentricity": dimensions.eccentricity_mm * 1e-3,
+    }
+
+
 def errors_of(scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErrors:
     """Noise and uncertainties of the curves of a scene with these certificates; that of the force must be there."""
-    force, dimensions = certificates["force"], scene.specimen
-    errors = CurveErrors(
-        force_noise=force.noise,
-        force_gain=force.gain_uncertainty,
-        thickness_uncertainty=dimensions.thickness_uncertainty_um / dimensions.thickness_um,
-        prestretch_uncertainty=dimensions.prestretch_uncertainty / dimensions.prestretch,
-        disk_radius_uncertainty=dimensions.disk_radius_uncertainty_mm / dimensions.disk_radius_mm,
-        eccentricity=dimensions.eccentricity_mm * 1e-3,
-    )
+    force = certificates["force"]
+    errors = CurveErrors(force_noise=force.noise, force_gain=force.gain_uncertainty)
+    errors.update(dimension_errors(scene.specimen))
     laser, hv = certificates.get("displacement"), certificates.get("hv")
     if laser is not None:
         errors["displacement_noise"] = laser.noise

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 ENTRY_POINTS = "dea_rig.commands"
-HELPERS = {"app", "files", "running", "show", "talk"}  # modules of this package that are no commands
+HELPERS = {"app", "files", "import_options", "running", "show", "talk"}  # modules of this package that are no commands
 EXIT_CODES = """Exit codes: 0 done; 1 failed; 2 a file or option cannot be used, nothing was touched; 3 a limit;
 4 a fault of the rig; 130 stopped by the operator."""
 

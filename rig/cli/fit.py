@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from rig.cli.files import FILE, tell_written
+from rig.cli.import_options import given, import_options, taken, understood_or_refused
 
 if TYPE_CHECKING:
     from rich.console import Group, RenderableType
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 @click.command("fit")
 @click.argument("logs", nargs=-1, required=True, type=FILE)
+@click.option("--scene", type=FILE, help="Scene whose [specimen] the tables are of; logs have their own inside.")
 @click.option("-o", "--out", type=FILE, help="Result as JSON.")
 @click.option("--report", type=FILE, help="Result as one self-contained HTML page.")
 @click.option("--terms", type=click.IntRange(1, 3), default=2, show_default=True, help="Ogden terms.")
@@ -33,8 +35,10 @@ if TYPE_CHECKING:
     show_default=True,
     help="Samples at which the film is wrinkled: leave out, or describe by the tension field. Counted either way.",
 )
+@import_options(cone=True)
 def command(
     logs: tuple[Path, ...],
+    scene: Path | None,
     out: Path | None,
     report: Path | None,
     terms: int,
@@ -42,29 +46,75 @@ def command(
     profiles: bool,
     posterior: bool,
     wrinkled: str,
+    dry_run: bool,
+    tidy: Path | None,
+    **words: Any,
 ) -> None:
-    """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties."""
+    """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties.
+
+    LOGS are logs of this program; or, with --scene, tables of another rig with columns of displacement, force and
+    voltage, in any encoding, separator and decimal sign. What is understood of a table is printed first; what cannot be
+    understood is asked for, with the option that tells it.
+    """
     from rig.analysis.film import identify_logs, write_results
     from rig.base.outputs import check_new
     from rig.base.progress import progress
     from rig.cli.show import show
 
-    check_new(out, report)
+    check_new(out, report, tidy)
+    options = taken(words)
+    _check_source(logs, scene, given(options) or dry_run or tidy is not None)
+    tables = None
+    if scene is not None:
+        from rig.analysis.imported import identify_cones, read_cones
+
+        tables = understood_or_refused(lambda: read_cones(logs, scene, options))
+        if tidy is not None:
+            from rig.importing.tidy import write_cone_table
+
+            write_cone_table(tidy, tables.tidy)
+    if dry_run:
+        tell_written(tidy)
+        return
     with progress("Markov chains around the fit") if posterior else nullcontext(lambda *_: None) as update:
-        found = identify_logs(
-            list(logs),
-            terms=terms,
-            comparing=comparing,
-            profiles=profiles,
-            wrinkled=wrinkled,
-            posterior=posterior,
-            progress=update,
-        )
+        settings: dict[str, Any] = {
+            "terms": terms,
+            "comparing": comparing,
+            "profiles": profiles,
+            "wrinkled": wrinkled,
+            "posterior": posterior,
+            "progress": update,
+        }
+        if tables is not None and scene is not None:
+            found = identify_cones(tables, logs, scene, **settings)
+        else:
+            found = identify_logs(list(logs), **settings)
     write_results(found, out, report)
-    tables = [comparison_table(found.comparison)] if comparing else []
-    tables += [posterior_table(found.identification)] if posterior else []
-    show(identification_table(found.identification), *tables, *(f"note: {note}" for note in found.notes))
-    tell_written(out, report)
+    parts = [comparison_table(found.comparison)] if comparing else []
+    parts += [posterior_table(found.identification)] if posterior else []
+    show(identification_table(found.identification), *parts, *(f"note: {note}" for note in found.notes))
+    tell_written(out, report, tidy)
+
+
+def _check_source(paths: Sequence[Path], scene: Path | None, about_tables: bool) -> None:
+    """Logs carry their scene; a table needs one. Raises `ConfigError` where they do not go together."""
+    from rig.base.errors import ConfigError
+    from rig.importing.text import is_log
+
+    missing = [str(path) for path in paths if not path.is_file()]
+    if missing:
+        raise ConfigError(f"{', '.join(missing)}: there is no such file.")
+    logs = [path for path in paths if is_log(path)]
+    if scene is not None and logs:
+        raise ConfigError(f"{logs[0]}: a log of this program has its scene inside; give it without --scene.")
+    others = [path for path in paths if path not in logs and path.suffix != ".mcap"]
+    if scene is None and others:
+        raise ConfigError(
+            f"{others[0]}: is no log of this program (MCAP). For a table of another rig add --scene scene.toml, whose "
+            "[specimen] says what film was measured."
+        )
+    if scene is None and about_tables:
+        raise ConfigError("Options about tables (--column, --dry-run, --tidy, ...) need tables, and these are logs.")
 
 
 def identification_table(found: Identification) -> Group:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from rig.cli.files import FILE, tell_written
+from rig.cli.import_options import import_options, taken, understood_or_refused, with_import
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -20,23 +21,39 @@ if TYPE_CHECKING:
 @click.option("-o", "--out", type=FILE, help="Result as JSON.")
 @click.option("--terms", type=click.IntRange(1, 4), default=3, show_default=True, help="Ogden terms.")
 @click.option("--predict", multiple=True, type=FILE, help="A test that takes no part and is predicted.")
-def command(tests: tuple[Path, ...], out: Path | None, terms: int, predict: tuple[Path, ...]) -> None:
-    """Identify Ogden parameters from homogeneous TESTS (CSV) of a sheet, all at once.
+@import_options(sheet=True)
+def command(
+    tests: tuple[Path, ...],
+    out: Path | None,
+    terms: int,
+    predict: tuple[Path, ...],
+    dry_run: bool,
+    tidy: Path | None,
+    **words: Any,
+) -> None:
+    """Identify Ogden parameters from homogeneous TESTS of a sheet, all at once.
 
-    Columns are stretch and nominal_stress_MPa (or _kPa, _Pa); for biaxial tests stretch1, stretch2,
-    nominal_stress1_MPa, nominal_stress2_MPa. A remark "# kind: uniaxial" (equibiaxial, pure shear, biaxial), or the
-    file's name, says which test it is.
+    TESTS are tables as testing machines and spreadsheets write them: text in any encoding, separator and decimal sign,
+    with columns of stretch, strain or extension, and of nominal stress or force. What is understood of each is printed
+    first; what cannot be understood is asked for, with the option that tells it. A shared set of options can stand in
+    DATA.import.toml beside DATA.csv. The kind of test is in the file, in its name, or in --kind.
     """
-    from rig.analysis.film import identify_tests
+    from rig.analysis.imported import identify_sheets, read_sheets
     from rig.base.outputs import check_new, write_text
     from rig.cli.show import show
 
-    check_new(out)
-    found = identify_tests(tests, predict, terms)
-    if out is not None:
-        write_text(out, found.to_json())
-    show(tests_table(found))
-    tell_written(out)
+    check_new(out, tidy)
+    read = understood_or_refused(lambda: read_sheets(tests, predict, taken(words)))
+    if tidy is not None:
+        from rig.importing.tidy import write_sheet_tests
+
+        write_sheet_tests(tidy, read.tests)
+    if not dry_run:
+        found = identify_sheets(read, terms=terms)
+        if out is not None:
+            write_text(out, with_import(found.to_json(), read.understood))
+        show(tests_table(found))
+    tell_written(None if dry_run else out, tidy)
 
 
 def tests_table(found: TestsFit) -> Group:

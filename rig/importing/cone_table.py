@@ -167,7 +167,7 @@ def _read(source: Source, piece: Piece, *, first: bool) -> Part | None:
     if len(findings.of("obstacle")) > before:
         return None
     values = dict(part.values)
-    if "time" in values and values["time"].size:
+    if time is not None and "time" in values and values["time"].size:
         values["time"] = (
             _rising(values["time"], part, source) if np.isfinite(values["time"]).all() else values.pop("time")
         )
@@ -206,8 +206,7 @@ def _rising(time: Array, part: Part, source: Source) -> Array:
         for k in back:
             shift[k + 1 :] += time[k] - time[k + 1] + usual
         time = time + shift
-    begun: Array = time - time[0]
-    return begun
+    return time
 
 
 def _turned(part: Part, source: Source, *, first: bool) -> Part:

@@ -34,9 +34,10 @@ POWER = {"uniaxial": -2.0, "equibiaxial": -5.0, "pure shear": -3.0}
 
 @dataclass(frozen=True)
 class SheetTests:
-    """Tests of all files, what was understood of each file, and all rows for a tidy table."""
+    """Tests of all files with the file of each, and what was understood of each file."""
 
     tests: list[HomogeneousTest]
+    sources: list[str]
     understood: list[Understood]
 
 
@@ -49,17 +50,19 @@ def read_sheet_tests(paths: Sequence[Path], options: ImportOptions | None = None
         With every obstacle of every file, and the option that removes it.
     """
     tests: list[HomogeneousTest] = []
+    sources: list[str] = []
     understood: list[Understood] = []
     findings: list[Finding] = []
     for path in paths:
         source = open_source(path, options or ImportOptions())
         found = _tests_of(source)
         tests += found
+        sources += [str(path)] * len(found)
         understood.append(source.understood)
         findings += source.findings.all
     findings += _same_data(tests)
     refuse(findings, [line for one in understood for line in one.lines()])
-    return SheetTests(_with_distinct_names(tests), understood)
+    return SheetTests(_with_distinct_names(tests), sources, understood)
 
 
 def _with_distinct_names(tests: Sequence[HomogeneousTest]) -> list[HomogeneousTest]:

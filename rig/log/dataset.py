@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Required, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ class Reference(NamedTuple):
 class CurveErrors(TypedDict, total=False):
     """The uncertainties of `calibration.film.curve.Curve`, which explains them."""
 
-    force_noise: Required[float]
+    force_noise: float  # must be there when a curve is made
     displacement_noise: float
     force_gain: float
     force_zero: float

@@ -1,0 +1,125 @@
+"""Other people's tables -> the same identification as logs: curves of a cone with a scene, tests of sheets without."""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from calibration.film.curve import CurveError
+from calibration.sheet.sheet_tests import HomogeneousTest, TestsError, TestsFit, fit_tests
+from rig.analysis.film import UNKNOWN_LAG, Found, dimension_errors, identify_curves
+from rig.base.errors import ConfigError, DataError
+from rig.base.table import Table
+from rig.base.text_file import read_text
+from rig.base.toml_file import validate
+from rig.importing.cone_table import ConeTable, read_cone_tables
+from rig.importing.options import ImportOptions
+from rig.importing.sheet_table import read_sheet_tests
+from rig.importing.understood import Understood
+from rig.scene.specimen import SpecimenTable
+
+
+class SpecimenScene(Table):
+    """What of a scene a table needs: the specimen."""
+
+    specimen: SpecimenTable
+
+
+def load_specimen(path: Path) -> tuple[SpecimenTable, str]:
+    """The ``[specimen]`` of a scene file, whatever else is in it, and the file's text.
+
+    Raises
+    ------
+    ConfigError
+        When the file cannot be read or has no specimen that can be used.
+    """
+    text = read_text(path, "scene")
+    try:
+        raw = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}.") from None
+    found = validate({key: value for key, value in raw.items() if key == "specimen"}, SpecimenScene, "scene", str(path))
+    return found.specimen, text
+
+
+def read_cones(paths: Sequence[Path], scene: Path, options: ImportOptions) -> ConeTable:
+    """The curves in tables of a rig, with the uncertainties of the scene's dimensions.
+
+    Raises
+    ------
+    ConfigError
+        When a table or the scene cannot be used.
+    """
+    specimen, _ = load_specimen(scene)
+    found = read_cone_tables(paths, specimen.specimen(), options)
+    errors = dimension_errors(specimen) | {"lag_uncertainty": UNKNOWN_LAG}
+    try:
+        return replace(found, curves=[replace(curve, **errors) for curve in found.curves])
+    except CurveError as error:
+        raise DataError(f"{error}.") from None
+
+
+def identify_cones(table: ConeTable, paths: Sequence[Path], scene: Path, **options: Any) -> Found:
+    """`identify_curves` on the curves of tables; ``options`` as there.
+
+    Raises
+    ------
+    DataError
+        When the curves cannot be fitted.
+    """
+    _, text = load_specimen(scene)
+    provenance: dict[str, object] = {
+        "tables": {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths},
+        "import": [one.to_dict() for one in table.understood],
+    }
+    found = identify_curves(table.curves, provenance, **options)
+    notes = [str(one) for each in table.understood for one in each.findings if one.severity == "warning"]
+    notes.append(
+        "noise is estimated from the scatter of the readings; gains (force and displacement 0.5 %, voltage 1 %), the "
+        "zero of force (1 % of the largest) and where the disk touches (20 um) are assumed, not stated"
+    )
+    return replace(found, notes=[*found.notes, *notes], scene_texts={str(scene): text})
+
+
+@dataclass(frozen=True)
+class SheetsRead:
+    """Tests to be fitted, tests to be predicted, and what was understood of all tables."""
+
+    tests: list[HomogeneousTest]
+    predict: list[HomogeneousTest]
+    understood: list[Understood]
+
+
+def read_sheets(paths: Sequence[Path], predict: Sequence[Path], options: ImportOptions) -> SheetsRead:
+    """Tests in tables of any layout.
+
+    Raises
+    ------
+    ImportRefused
+        With every obstacle of every file.
+    """
+    found = read_sheet_tests([*paths, *predict], options)
+    held = {str(path) for path in predict} - {str(path) for path in paths}
+    tests: list[HomogeneousTest] = []
+    predicted: list[HomogeneousTest] = []
+    for test, source in zip(found.tests, found.sources, strict=True):
+        (predicted if source in held else tests).append(test)
+    return SheetsRead(tests, predicted, found.understood)
+
+
+def identify_sheets(read: SheetsRead, **options: Any) -> TestsFit:
+    """`fit_tests` on tests that were read; ``options`` as there.
+
+    Raises
+    ------
+    DataError
+        When the tests cannot be fitted.
+    """
+    try:
+        return fit_tests(read.tests, predict=read.predict, **options)
+    except TestsError as error:
+        raise DataError(f"{error}.") from None
