@@ -110,7 +110,7 @@ def _check_source(paths: Sequence[Path], scene: Path | None, about_tables: bool)
     others = [path for path in paths if path not in logs and path.suffix != ".mcap"]
     if scene is None and others:
         raise ConfigError(
-            f"{others[0]}: is no log of this program (MCAP). For a table of another rig add --scene scene.toml, whose "
+            f"{others[0]}: not a log of this program (MCAP). For a table of another rig add --scene scene.toml, whose "
             "[specimen] says what film was measured."
         )
     if scene is None and about_tables:
