@@ -173,6 +173,33 @@ def read_tables(path: Path, topics: Collection[str]) -> tuple[Log, dict[str, Col
     return log, {topic: table.columns() for topic, table in tables.items()}
 
 
+def tables_of(
+    path: Path, content: bytes, channels: dict[int, ChannelInfo], topics: Collection[str]
+) -> dict[str, Columns]:
+    """The messages on ``topics`` in one chunk's checked ``content``; its channels are added to ``channels``.
+
+    Raises
+    ------
+    Damaged
+        The content is not a sequence of messages.
+    LogError
+        It was written with another schema version.
+    """
+    found = messages(content, channels)
+    wanted = {number: channel for number, channel in channels.items() if channel.topic in topics}
+    tally = _Tally(path)
+    tally.version = ""
+    for channel in set(wanted.values()):
+        tally.check_schema(channel)
+    tables: dict[str, Columns] = {}
+    for topic, mine in _by_topic(wanted, found):
+        if mine.any():
+            table = _Table(path, topic)
+            table.add(content, found, mine)
+            tables[topic] = table.columns()
+    return tables
+
+
 def _read(source: Source, tables: dict[str, _Table]) -> Log:
     scan = Scan(source)
     tally = _Tally(source.path)
@@ -243,7 +270,7 @@ class _Tally:
             raise Damaged("a chunk with an impossible time")
         channels = {number: self._channels[number] for number in np.unique(found.channel).tolist()}
         for channel in channels.values():
-            self._check_schema(channel)
+            self.check_schema(channel)
         for number, channel in channels.items():
             sequence = found.sequence[found.channel == number]
             topic, last = channel.topic, int(sequence[-1])
@@ -266,7 +293,7 @@ class _Tally:
                 "Read it with the version of dea-rig that wrote it; its metadata names it.",
             )
 
-    def _check_schema(self, channel: ChannelInfo) -> None:
+    def check_schema(self, channel: ChannelInfo) -> None:
         if channel in self._checked or channel.topic not in schema.CHANNELS:
             return
         expected = ("protobuf", schema.schema_name(channel.topic), schema.schema_data(channel.topic))

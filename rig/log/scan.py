@@ -141,6 +141,10 @@ class Source:
             raise LogError(self.path, f"cannot be read at byte {offset} ({error.strerror})") from error
         return b"".join(parts)
 
+    def refresh(self) -> None:
+        """Look how long the file is now."""
+        self.size = os.fstat(self._fd).st_size
+
     def body(self, record: Record) -> bytes:
         """The record without its opcode and length."""
         body = self.at(record.start + _HEAD.size, record.end - record.start - _HEAD.size)
@@ -175,9 +179,9 @@ class Scan:
         offset, size = len(MAGIC), self.source.size
         while offset < size and len(self.gaps) < MAX_GAPS:
             try:
-                record = self._record(offset)
+                record = self.record_at(offset)
             except Damaged as why:
-                found = self._next_landmark(offset + 1)
+                found = self.next_landmark(offset + 1)
                 self._gap(offset, found, str(why))
                 offset = found
                 continue
@@ -225,8 +229,8 @@ class Scan:
         table = _table(body, at)
         return name, table
 
-    def _record(self, offset: int) -> Record:
-        """The record at ``offset`` if it has the right shape."""
+    def record_at(self, offset: int) -> Record:
+        """The record at ``offset`` if it has the right shape. Raises `Damaged`."""
         look = self.source.at(offset, _LOOK)
         if len(look) < _HEAD.size:
             raise Damaged("the file ends in the middle of a record")
@@ -252,14 +256,14 @@ class Scan:
         except (Damaged, struct.error):
             return False
 
-    def _next_landmark(self, offset: int) -> int:
+    def next_landmark(self, offset: int) -> int:
         """Where the next sound record begins at or behind ``offset``; the file's size if there is none."""
         while offset < self.source.size:
             window = self.source.at(offset, _WINDOW + _HEAD.size - 1)
             for match in _LANDMARK.finditer(window):
                 at = offset + match.start()
                 try:
-                    self._record(at)
+                    self.record_at(at)
                 except Damaged:
                     continue
                 return at
@@ -287,10 +291,12 @@ class Scan:
             )
 
 
-def chunk_content(source: Source, record: Record) -> bytes:
-    """The content of a chunk whose size is known to be bearable, with its checksum checked. Raises `Damaged`."""
+def chunk_content(source: Source, record: Record, most: int = MAX_CHUNK) -> bytes:
+    """The content of a chunk of at most ``most`` bytes, with its checksum checked. Raises `Damaged`."""
     body = source.body(record)
     _, _, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
+    if size > most:
+        raise Damaged(f"a chunk of {size} bytes; at most {most} are read")
     compression = body[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name_length]
     data = memoryview(body)[_CHUNK_HEAD.size + name_length + 8 :]
     if compression == b"zstd":

@@ -96,7 +96,7 @@ def live_run(log: Path | None = None) -> LiveRun:
     ConfigError
         When there is none, or it is not clear which one is meant.
     """
-    runs = [run for file in sorted(run_directory().glob("*.json")) if (run := _announced(file)) and run.live]
+    runs = live_runs()
     if log is not None:
         runs = [run for run in runs if Path(run.log) == log.resolve()]
     if not runs:
@@ -107,6 +107,11 @@ def live_run(log: Path | None = None) -> LiveRun:
         listing = "\n".join(f"  {run.log}" for run in runs)
         raise ConfigError(f"Several runs are going on; name the log of the one that is meant:\n{listing}")
     return runs[0]
+
+
+def live_runs() -> list[LiveRun]:
+    """All runs of this user that are going on. Raises `ConfigError` as `run_directory`."""
+    return [run for file in sorted(run_directory().glob("*.json")) if (run := _announced(file)) and run.live]
 
 
 def _announced(file: Path) -> LiveRun | None:
