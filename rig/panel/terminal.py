@@ -83,5 +83,3 @@ def _table(page: dict[str, object]) -> Table:
     if not page["ended"]:
         table.add_row("", Text("stop it from any terminal: dea-rig stop", "dim"))
     return table
-
-
