@@ -52,8 +52,8 @@ class LiveRun:
     token: str
     log: str
 
-    def send(self, text: str) -> dict[str, str]:
-        """One request and its reply.
+    def send(self, text: str, source: str = "terminal") -> dict[str, str]:
+        """One request and its reply; ``source`` is a key of `rig.operator.remote.SOURCES`.
 
         Raises
         ------
@@ -64,7 +64,7 @@ class LiveRun:
         """
         try:
             with socket.create_connection(("127.0.0.1", self.port), timeout=REPLY_S) as line:
-                line.sendall(f"{self.token} {' '.join(text.split())}\n".encode())
+                line.sendall(f"{self.token} {source} {' '.join(text.split())}\n".encode())
                 reply = json.loads(b"".join(iter(lambda: line.recv(LONGEST), b"")))
                 return {str(key): str(value) for key, value in reply.items()}
         except ConnectionError:

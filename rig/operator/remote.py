@@ -1,7 +1,7 @@
 """Wishes for a run from another terminal: a socket on 127.0.0.1, announced with a token in the user's run directory.
 
 The run writes ``<pid>.json`` there, readable by its user alone; ``dea-rig stop``, ``pause`` and ``continue`` find it. A
-request is one line, ``token word [text]``; the reply is one line of JSON. Nothing here waits or raises on the side of
+request is one line, ``token source word [text]``; the reply is one line of JSON. Nothing here waits or raises on the side of
 the run: it is never ended by somebody who talks to it badly.
 """
 
@@ -21,10 +21,14 @@ from rig.operator.live import LONGEST, run_directory
 MOST = 8  # connections at a time
 
 
+# Who may speak, and what the log calls him.
+SOURCES = {"terminal": "another terminal", "panel": "the panel"}
+
+
 class Remote:
     """The run's end: a `rig.operator.control.Source`."""
 
-    name = "another terminal"
+    name = SOURCES["terminal"]
 
     def __init__(self, log: Path) -> None:
         self._token = secrets.token_hex(16)
@@ -70,8 +74,8 @@ class Remote:
         token, _, rest = line.partition(b"\n")[0].partition(b" ")
         if not hmac.compare_digest(token, self._token.encode()):
             return {"said": "Refused: this is not the token of this run."}
-        text = rest.decode(errors="replace")
-        said = control.take(text, self.name) if text != "status" else ""
+        source, _, text = rest.decode(errors="replace").partition(" ")
+        said = control.take(text, SOURCES.get(source, self.name)) if text != "status" else ""
         return {"said": said, **control.describe()}
 
     def _hang_up(self, caller: socket.socket) -> None:

@@ -75,6 +75,7 @@ class RunView:
         self._arrived = time.monotonic()
         self._t = 0.0
         self._next_point = -math.inf
+        self._placed: tuple[float, float] | None = None  # time and reading of the newest displacement
         self._run: LiveRun | None = None
         self._said: dict[str, str] = {}
         self._error = ""
@@ -161,16 +162,19 @@ class RunView:
             values = of["position_m"]
         else:
             return
+        before = [self._placed] if self._placed is not None else []
+        times = np.concatenate([[t for t, _ in before], of["t_s"]])
+        places = (np.concatenate([[place for _, place in before], values]) - zero) * 1e3
+        self._placed = (float(of["t_s"][-1]), float(values[-1]))
         starts = np.array([phase["t_s"] for phase in self._phases])
         for t, newtons in zip(force["t_s"].tolist(), force["force_N"].tolist(), strict=True):
-            if t < self._next_point:
-                continue
+            if not max(self._next_point, times[0]) <= t <= times[-1]:
+                continue  # between two displacements only
             now = int(np.searchsorted(starts, t, side="right")) - 1
             if now < 0 or not self._phases[now]["contact"]:
                 continue
             self._next_point = t + LOOP_S
-            place = (float(np.interp(t, of["t_s"], values)) - zero) * 1e3
-            self._loop.add(place, newtons * 1e3, self._phases[now]["voltage_V"])
+            self._loop.add(float(np.interp(t, times, places)), newtons * 1e3, self._phases[now]["voltage_V"])
 
     def _take_displacement(self, new: Columns) -> None:
         self._has_laser = True
@@ -262,6 +266,8 @@ class RunView:
         voltage = self._latest.get("voltage_V")
         if not self._has_hv:
             return State.NO_HV if outcome is not None or self._phases else State.UNKNOWN
+        if outcome is not None and voltage is not None and abs(voltage) < SAFE_VOLTAGE:
+            return State.SAFE  # as measured at the end; the flags of the last sample may be older than that
         if voltage is None or (outcome is None and self.age > OLD_S):
             return State.UNKNOWN
         if abs(voltage) >= SAFE_VOLTAGE:
@@ -361,7 +367,7 @@ class RunView:
             run = live_run(self.path)
             if run.send("status").get("expected") and text.strip().lower() not in (*STOP, *PAUSE, *CONTINUE):
                 raise RigError("This is confirmed by typing in the terminal that started the run.")
-            return run.send(text).get("said", "")
+            return run.send(text, "panel").get("said", "")
         except ConnectionError:
             raise RigError("The run has ended: nobody listens any more.") from None
 

@@ -2,6 +2,7 @@
 "use strict";
 
 const ASK_MS = 100;
+const DRAW_MS = 150;
 const OLD_S = 1.0;
 const HOLE_S = 1.0;
 const TRACES = [
@@ -23,6 +24,8 @@ let loop = { generation: -1, points: [] };
 let outlook = null;
 let heard = 0; // when the server last answered
 let last = null;
+let changed = true; // since the pictures were drawn
+let drawn = ""; // the window's size then
 
 function forget() {
   curves = {};
@@ -108,6 +111,8 @@ function take(news) {
   if (news.loop.generation !== loop.generation || news.loop.first === 0) loop = { generation: news.loop.generation, points: news.loop.points };
   else loop.points.splice(news.loop.first, Infinity, ...news.loop.points);
   if (news.outlook && !news.outlook.error) outlook = news.outlook;
+  const moved = !last || last.t_s !== news.t_s || Boolean(news.outlook);
+  changed = changed || moved;
   last = news;
   show(news);
 }
@@ -390,11 +395,16 @@ function draw() {
     byId("old").textContent = `The panel's server has not answered for ${time(silent)}. Nothing here is current.`;
     if (!(last && last.ended)) showState("UNKNOWN", NOTES.UNKNOWN);
   }
+  const size = `${window.innerWidth} ${window.innerHeight}`;
+  if (!changed && size === drawn) return; // a finished log costs nothing
+  changed = false;
+  drawn = size;
   drawTime();
   drawLoop();
   drawShape();
 }
 
-setInterval(draw, 100);
+setInterval(draw, DRAW_MS);
+window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { changed = true; });
 findRuns();
 ask();
