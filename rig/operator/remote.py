@@ -1,8 +1,8 @@
 """Wishes for a run from another terminal: a socket on 127.0.0.1, announced with a token in the user's run directory.
 
 The run writes ``<pid>.json`` there, readable by its user alone; ``dea-rig stop``, ``pause`` and ``continue`` find it. A
-request is one line, ``token source word [text]``; the reply is one line of JSON. Nothing here waits or raises on the side of
-the run: it is never ended by somebody who talks to it badly.
+request is one line, ``token source word [text]``; the reply is one line of JSON. Nothing here waits or raises on the
+side of the run: it is never ended by somebody who talks to it badly.
 """
 
 from __future__ import annotations
