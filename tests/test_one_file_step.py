@@ -1,0 +1,151 @@
+"""A protocol step is added by one file outside the tree, named by an entry point of another distribution."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+SCENES = Path(str(files("sim_fixtures"))) / "scenes"
+STEP = '''
+"""``do = "knock"``: the disk goes in and out a little, several times."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from rig.base.errors import LimitError
+from rig.steps.base import Action, Positive, Step
+from rig.steps.turns import go
+
+
+class Knock(Step):
+    """Go in and out a little, several times."""
+
+    needs_contact: ClassVar[bool] = True
+    records: ClassVar[bool] = True
+
+    do: Literal["knock"] = Field(description="The kind of step.")
+    depth_mm: Positive = Field(description="How deep (mm). Typical: 0.5 to 1.")
+    times: int = Field(default=2, ge=1, le=10, description="How often.")
+
+    def plan(self, state, scene):
+        depth = self.depth_mm * 1e-3
+        if depth > 1e-3:
+            raise LimitError(f"{self.where(state.number)}: more than 1 mm is no knock.")
+        for cycle in range(1, self.times + 1):
+            yield Knocking(
+                by=self, step=state.number, label=f"knock {cycle}", h=(state.h, state.h + depth), duration=2.0,
+                speed=2e-3, cycle=cycle, record=True,
+            )
+            state.h += depth
+
+
+@dataclass(frozen=True, kw_only=True)
+class Knocking(Action):
+    def carry_out(self, rig):
+        yield from go(rig, self.h[1], self.speed, self.allowed_s)
+'''
+PROTOCOL = """
+title = "With a step from elsewhere"
+[[step]]
+do = "home"
+[[step]]
+do = "zero"
+[[step]]
+do = "approach"
+speed_mm_per_s = 2.0
+max_travel_mm = 8.0
+threshold_mN = 8.0
+[[step]]
+do = "knock"
+depth_mm = 0.8
+times = 3
+[[step]]
+do = "return"
+"""
+
+
+def dea_rig(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "160"}
+    command = [sys.executable, "-m", "rig", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=110)
+
+
+@pytest.fixture
+def other_package(tmp_path: Path) -> Path:
+    (tmp_path / "knocking.py").write_text(STEP)
+    about = tmp_path / "knocking_for_rigs-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: knocking-for-rigs\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[dea_rig.steps]\nknock = knocking:Knock\n")
+    (tmp_path / "protocol.toml").write_text(PROTOCOL)
+    return tmp_path
+
+
+def test_the_step_is_checked_run_recorded_and_replayed(other_package: Path) -> None:
+    scene, protocol, log = SCENES / "no-hv.toml", other_package / "protocol.toml", other_package / "run.mcap"
+    checked = dea_rig(other_package, "check", scene, protocol)
+    assert checked.returncode == 0, checked.stderr
+    assert "knock: knock 3" in checked.stdout
+    done = dea_rig(other_package, "run", scene, protocol, "-o", log)
+    assert done.returncode == 0, done.stderr
+    replayed = dea_rig(other_package, "replay", log)
+    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
+    look = (
+        "from pathlib import Path\nfrom rig.log.dataset import load_run\n"
+        f"run = load_run(Path({str(log)!r}), {{}})\n"
+        "told = [(p.cycle, p.direction) for p in run.phases if p.kind == 'knock' and p.record]\n"
+        "print(told, max(h for h in run.h if h == h) > 2.3e-3)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(other_package)}
+    told = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, env=environment, timeout=60)
+    assert told.stdout == "[(1, 1), (2, 1), (3, 1)] True\n", told.stderr
+
+
+def test_its_errors_list_its_own_keys_and_its_plan_refuses_in_the_family(other_package: Path) -> None:
+    protocol = other_package / "protocol.toml"
+    protocol.write_text(PROTOCOL.replace("times = 3", "time = 3"))
+    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
+    assert done.returncode == 2
+    assert "step 4, time: unknown key; did you mean times? Allowed here: depth_mm, do, times." in done.stderr
+    protocol.write_text(PROTOCOL.replace("depth_mm = 0.8", "depth_mm = 3"))
+    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
+    assert (done.returncode, done.stderr) == (3, "Step 4 (knock): more than 1 mm is no knock.\n")
+    protocol.write_text(PROTOCOL.replace('"knock"', '"knok"'))
+    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
+    assert done.returncode == 2 and 'did you mean "knock"?' in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "words"),
+    [
+        ("import no_such_module_at_all\n", "no_such_module_at_all"),
+        ("Knock = 7\n", "is no rig.steps.base.Step"),
+        (STEP.replace('"knock"', '"tap"'), "its `do` is 'tap'"),
+    ],
+)
+def test_one_that_cannot_be_loaded_names_its_package_and_leaves_other_protocols_alone(
+    other_package: Path, spoilt: str, words: str
+) -> None:
+    (other_package / "knocking.py").write_text(spoilt)
+    protocol = other_package / "protocol.toml"
+    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "package knocking-for-rigs" in done.stderr and words in done.stderr
+    protocol.write_text(PROTOCOL.split('[[step]]\ndo = "knock"')[0])
+    assert dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol).returncode == 0
+
+
+def test_a_name_of_the_programs_own_is_not_taken_over(other_package: Path) -> None:
+    about = other_package / "knocking_for_rigs-1.0.dist-info" / "entry_points.txt"
+    about.write_text("[dea_rig.steps]\nhome = knocking:Knock\n")
+    protocol = other_package / "protocol.toml"
+    protocol.write_text('[[step]]\ndo = "home"\n')
+    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
+    assert done.returncode == 0 and "find the reference position" in done.stdout
