@@ -73,7 +73,7 @@ class Dialect:
         if self.prefix:
             line = PREFIX.sub("", line, count=1)
         if self.separator == " ":
-            return line.split()
+            return [cell.strip('"') for cell in re.findall(r'"[^"]*"|\S+', line)] if self.quoted else line.split()
         if self.quoted and '"' in line:
             try:
                 return [

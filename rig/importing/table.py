@@ -234,7 +234,12 @@ def _state(dialect: Dialect, cells: list[str], width: int, numeric: Sequence[boo
         return "wide" if good >= 2 and not bad and kinds.count("X") <= 1 else "text"
     if not bad and good + missing >= 2 and good >= 1:
         return "clean"
-    return "bad" if bad and len(kinds) >= width - 1 and good >= 2 and good > bad else "text"
+    if bad and len(kinds) >= width - 1 and good >= 2 and good > bad:
+        return "bad"
+    # In a table of two columns one bad cell leaves one number: a number gone wrong, not a word beside a number.
+    wrong = [cell for cell, kind, one in zip(cells, kinds, numeric, strict=False) if one and kind == "X"]
+    digits = bad == 1 and re.match(r"[+-.,]*[0-9]", wrong[0]) and good + bad + missing == sum(numeric)
+    return "bad" if digits and good >= 1 else "text"
 
 
 def _divides(waiting: Sequence[TextRow], current: Section, cells: Sequence[str], dialect: Dialect) -> bool:

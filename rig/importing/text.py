@@ -122,7 +122,9 @@ def _one_byte(raw: bytes) -> str:
         if any(mark in words for mark in ("µm", "m²", "°c", "länge", "prüf", "zerst", "éprouvette", "déplacement")):
             return name
     best = from_bytes(sample, cp_isolation=list(ONE_BYTE)).best()
-    return best.encoding if best is not None else ONE_BYTE[0]
+    if best is None or sample.decode(best.encoding, errors="replace") == sample.decode(ONE_BYTE[0], errors="replace"):
+        return ONE_BYTE[0]
+    return best.encoding
 
 
 def _refused(path: Path, what: str, option: str = "") -> ImportRefused:
