@@ -1,4 +1,4 @@
-"""Tables as other programs and other people write them, from numbers that are known: each is read to the same numbers."""
+"""Tables as other programs and people write them, from numbers that are known: each is read to the same numbers."""
 
 from __future__ import annotations
 
@@ -34,61 +34,120 @@ LAYOUTS: dict[str, tuple[str, str, str]] = {
     # name of the file: text, encoding, what the report has to say
     "uniaxial_plain.csv": ("stretch,nominal_stress_MPa\n" + rows(STRETCH, STRESS / 1e6), "utf-8", ""),
     "Zug_probe.csv": (
-        "Zeit;Dehnung;Spannung\ns;%;kPa\n" + rows(TIME, 100 * STRAIN, STRESS / 1e3, separator=";", comma=True), "cp1252", "decimal sign ','",
+        "Zeit;Dehnung;Spannung\ns;%;kPa\n" + rows(TIME, 100 * STRAIN, STRESS / 1e3, separator=";", comma=True),
+        "cp1252",
+        "decimal sign ','",
     ),
     "traction_film.csv": (
-        "Temps (s);Déformation (%);Contrainte (MPa)\n" + rows(TIME, 100 * STRAIN, STRESS / 1e6, separator=";", comma=True), "cp1252", "cp1252",
+        "Temps (s);Déformation (%);Contrainte (MPa)\n"
+        + rows(TIME, 100 * STRAIN, STRESS / 1e6, separator=";", comma=True),
+        "cp1252",
+        "cp1252",
     ),
-    "uniaxial_utf16.txt": ("Strain [-]\tStress [kPa]\n" + rows(STRAIN, STRESS / 1e3, separator="\t"), "utf-16", "utf-16"),
-    "uniaxial_utf16_no_mark.txt": ("Strain [-]\tStress [kPa]\n" + rows(STRAIN, STRESS / 1e3, separator="\t"), "utf-16-le", "utf-16-le"),
+    "uniaxial_utf16.txt": (
+        "Strain [-]\tStress [kPa]\n" + rows(STRAIN, STRESS / 1e3, separator="\t"),
+        "utf-16",
+        "utf-16",
+    ),
+    "uniaxial_utf16_no_mark.txt": (
+        "Strain [-]\tStress [kPa]\n" + rows(STRAIN, STRESS / 1e3, separator="\t"),
+        "utf-16-le",
+        "utf-16-le",
+    ),
     "mts_tensile.txt": (
-        "MTS793|MPT|ENU|1|2|.|/|:|1|0|0|A\n\nSpecimen Width: 4.0 mm\nSpecimen Thickness: 2.0 mm\nGauge Length: 25.0 mm\n\n"
-        "Running Time\tAxial Displacement\tAxial Force\nsec\tmm\tN\n" + rows(TIME, EXTENSION, FORCE, separator="\t", decimals=9),
-        "utf-8", "over 25 mm",
+        "MTS793|MPT|ENU|1|2|.|/|:|1|0|0|A\n\nSpecimen Width: 4.0 mm\nSpecimen Thickness: 2.0 mm\nGauge Length: "
+        "25.0 mm\n\n"
+        "Running Time\tAxial Displacement\tAxial Force\nsec\tmm\tN\n"
+        + rows(TIME, EXTENSION, FORCE, separator="\t", decimals=9),
+        "utf-8",
+        "over 25 mm",
     ),
     "zwick_zugversuch.csv": (
-        '"Probenbreite b0";4,00;"mm"\n"Probendicke a0";2,00;"mm"\n"Messlänge L0";25,0;"mm"\n\n"Verlängerung";"Kraft"\n"mm";"mN"\n'
-        + rows(EXTENSION, FORCE * 1e3, separator=";", comma=True, decimals=9), "cp1252", "over 8 mm2",
+        '"Probenbreite b0";4,00;"mm"\n"Probendicke a0";2,00;"mm"\n"Messlänge '
+        'L0";25,0;"mm"\n\n"Verlängerung";"Kraft"\n"mm";"mN"\n'
+        + rows(EXTENSION, FORCE * 1e3, separator=";", comma=True, decimals=9),
+        "cp1252",
+        "over 8 mm2",
     ),
     "uniaxial_imperial.csv": (
-        "Width,0.157480314960,in\nThickness,0.0787401574803,in\nGauge length,0.984251968504,in\nExtension (in),Load (lbf)\n"
-        + rows(EXTENSION * 1e-3 / INCH, FORCE / POUND, decimals=12), "utf-8", "lbf",
+        "Width,0.157480314960,in\nThickness,0.0787401574803,in\nGauge length,0.984251968504,in\nExtension "
+        "(in),Load (lbf)\n" + rows(EXTENSION * 1e-3 / INCH, FORCE / POUND, decimals=12),
+        "utf-8",
+        "lbf",
     ),
-    "uniaxial_kgf.csv": ("Strain (%),Load (kgf)\n" + rows(100 * STRAIN, FORCE / GRAVITY, decimals=9), "utf-8", "--area"),
-    "uniaxial_balance.csv": ("Strain (%),Load (g)\n" + rows(100 * STRAIN, 1e3 * FORCE / GRAVITY, decimals=9), "utf-8", "--area"),
-    "uniaxial_hencky.csv": ("Hencky strain,Cauchy stress (kPa)\n" + rows(np.log(STRETCH), STRESS * STRETCH / 1e3), "utf-8", "exp(true strain)"),
+    "uniaxial_kgf.csv": (
+        "Strain (%),Load (kgf)\n" + rows(100 * STRAIN, FORCE / GRAVITY, decimals=9),
+        "utf-8",
+        "--area",
+    ),
+    "uniaxial_balance.csv": (
+        "Strain (%),Load (g)\n" + rows(100 * STRAIN, 1e3 * FORCE / GRAVITY, decimals=9),
+        "utf-8",
+        "--area",
+    ),
+    "uniaxial_hencky.csv": (
+        "Hencky strain,Cauchy stress (kPa)\n" + rows(np.log(STRETCH), STRESS * STRETCH / 1e3),
+        "utf-8",
+        "exp(true strain)",
+    ),
     "uniaxial_true.csv": (
         "True Strain;True Stress (MPa);Engineering Strain;Engineering Stress (MPa)\n"
-        + rows(np.log(STRETCH), STRESS * STRETCH / 1e6, STRAIN, STRESS / 1e6, separator=";"), "utf-8", "not true strain",
+        + rows(np.log(STRETCH), STRESS * STRETCH / 1e6, STRAIN, STRESS / 1e6, separator=";"),
+        "utf-8",
+        "not true strain",
     ),
     "tensile_hms.csv": (
         "Time,Strain,Stress (kPa)\n"
-        + "".join(f"0:{int(t) // 60:02d}:{t % 60:06.3f},{a:.6f},{b:.6f}\n" for t, a, b in zip(TIME, STRAIN, STRESS / 1e3, strict=True)),
-        "utf-8", "",
+        + "".join(
+            f"0:{int(t) // 60:02d}:{t % 60:06.3f},{a:.6f},{b:.6f}\n"
+            for t, a, b in zip(TIME, STRAIN, STRESS / 1e3, strict=True)
+        ),
+        "utf-8",
+        "",
     ),
     "uniaxial_index.csv": (
-        ",strain,stress_kPa\n" + "".join(f"{k},{a:.6f},{b:.6f}\n" for k, (a, b) in enumerate(zip(STRAIN, STRESS / 1e3, strict=True))), "utf-8", "",
+        ",strain,stress_kPa\n"
+        + "".join(f"{k},{a:.6f},{b:.6f}\n" for k, (a, b) in enumerate(zip(STRAIN, STRESS / 1e3, strict=True))),
+        "utf-8",
+        "",
     ),
     "uniaxial_r.txt": (
-        '"stretch" "stress_kPa"\n' + "".join(f'"{k + 1}" {a:.6f} {b:.6f}\n' for k, (a, b) in enumerate(zip(STRETCH, STRESS / 1e3, strict=True))),
-        "utf-8", "",
+        '"stretch" "stress_kPa"\n'
+        + "".join(f'"{k + 1}" {a:.6f} {b:.6f}\n' for k, (a, b) in enumerate(zip(STRETCH, STRESS / 1e3, strict=True))),
+        "utf-8",
+        "",
     ),
     "uniaxial_savetxt.txt": ("# stretch stress_kPa\n" + rows(STRETCH, STRESS / 1e3, separator=" "), "utf-8", "blanks"),
     "uniaxial_thousands.csv": (
-        '"Strain (%)","Stress (Pa)"\n' + "".join(f'"{a:.4f}","{b:,.3f}"\n' for a, b in zip(100 * STRAIN, STRESS, strict=True)), "utf-8", "",
+        '"Strain (%)","Stress (Pa)"\n'
+        + "".join(f'"{a:.4f}","{b:,.3f}"\n' for a, b in zip(100 * STRAIN, STRESS, strict=True)),
+        "utf-8",
+        "",
     ),
     "Zug_tausender.csv": (
         "Dehnung [%];Spannung [Pa]\n"
-        + "".join(f"{a:.4f};{b:,.3f}\n".replace(",", " ").replace(".", ",") for a, b in zip(100 * STRAIN, STRESS, strict=True)), "utf-8", "decimal sign ','",
+        + "".join(
+            f"{a:.4f};{b:,.3f}\n".replace(",", " ").replace(".", ",") for a, b in zip(100 * STRAIN, STRESS, strict=True)
+        ),
+        "utf-8",
+        "decimal sign ','",
     ),
     "uniaxial_remarks.csv": (
-        "Stretch,Stress (kPa)\n" + rows(STRETCH[:20], STRESS[:20] / 1e3) + "operator: door opened\n" + rows(STRETCH[20:], STRESS[20:] / 1e3),
-        "utf-8", "no row of numbers",
+        "Stretch,Stress (kPa)\n"
+        + rows(STRETCH[:20], STRESS[:20] / 1e3)
+        + "operator: door opened\n"
+        + rows(STRETCH[20:], STRESS[20:] / 1e3),
+        "utf-8",
+        "no row of numbers",
     ),
-    "uniaxial_minus.csv": ("strain,stress (kPa)\n" + rows(STRAIN, -STRESS / 1e3).replace("-", "−"), "utf-8", "its sign is reversed"),
+    "uniaxial_minus.csv": (
+        "strain,stress (kPa)\n" + rows(STRAIN, -STRESS / 1e3).replace("-", "−"),
+        "utf-8",
+        "its sign is reversed",
+    ),
     "uniaxial_kilo.csv": ("Strain (%),Stress (KPA)\n" + rows(100 * STRAIN, STRESS / 1e3), "utf-8", "kPa"),
     "uniaxial_trailing.csv": ("stretch,stress_kPa\n" + rows(STRETCH, STRESS / 1e3).replace("\n", ",,\n"), "utf-8", ""),
-}  # fmt: skip
+}
 WITH_AREA = from_words(area_mm2=8.0)
 
 
@@ -132,7 +191,11 @@ PLAIN = "stretch,nominal_stress_kPa\n" + rows(STRETCH, STRESS / 1e3)
         ("uniaxial.csv", lambda text: text.replace("_kPa", ""), ["unit of stress", "missing", "--unit stress=MPa"]),
         ("uniaxial.csv", lambda text: text.replace("stress_kPa", "stress (furlong)"), ["stress", "--unit stress="]),
         ("uniaxial.csv", lambda text: text.replace("_kPa", "_mm"), ["--"]),
-        ("uniaxial.csv", lambda text: text.replace("stretch", "stress_kPa", 1), ["2 columns can be the stress", "--column stress=1"]),
+        (
+            "uniaxial.csv",
+            lambda text: text.replace("stretch", "stress_kPa", 1),
+            ["2 columns can be the stress", "--column stress=1"],
+        ),
         ("uniaxial.csv", lambda text: text.replace("1.250000,", "1_0,"), ["line 12", "column 1", "'1_0'", "--rows"]),
         ("uniaxial.csv", lambda text: text.replace("1.250000,", "NaN,"), ["line 12", "column 1", "'NaN'"]),
         ("uniaxial.csv", lambda text: text.replace("1.250000,", "inf,"), ["line 12", "'inf'"]),
@@ -141,7 +204,7 @@ PLAIN = "stretch,nominal_stress_kPa\n" + rows(STRETCH, STRESS / 1e3)
         ("biaxial.csv", lambda text: text, ["two stretches and two stresses", "--kind equibiaxial"]),
         ("uniaxial_planar.csv", lambda text: "# kind: uniaxial\n" + text, ["two kinds"]),
     ],
-)  # fmt: skip
+)
 def test_it_is_refused_and_the_message_names_the_place_and_the_option(
     tmp_path: Path, name: str, change: Callable[[str], str], words: list[str]
 ) -> None:
