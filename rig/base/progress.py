@@ -28,9 +28,9 @@ def _bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
         BarColumn(bar_width=24),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeRemainingColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
     )
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False, emoji=False)
     console.print(title)
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=None)

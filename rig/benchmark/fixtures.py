@@ -46,34 +46,36 @@ Share = Annotated[float, Field(gt=0, le=1)]
 class Truth(Table):
     """Of the simulated film."""
 
-    G_Pa: float = Field(gt=0)
-    eps_r: float | None = Field(default=None, gt=1)
+    G_Pa: float = Field(gt=0, description="Shear modulus at small strain (Pa).")
+    eps_r: float | None = Field(default=None, gt=1, description="Relative permittivity. Absent: nothing tells it.")
 
 
 class Fit(Table):
     """How near to the truth an identification with ``terms`` Ogden terms must come."""
 
-    terms: int = Field(ge=1, le=3)
-    G_relative_tolerance: Share
-    eps_r_relative_tolerance: Share | None = None
+    terms: int = Field(ge=1, le=3, description="Ogden terms of the fit.")
+    G_relative_tolerance: Share = Field(description="How far G may be off, as a part of the truth.")
+    eps_r_relative_tolerance: Share | None = Field(default=None, description="The same of eps_r.")
 
 
 class Expected(Table):
     """What must come out of the log."""
 
-    status: Literal["complete", "limit", "fault", "cut short"]
-    reason: str = ""  # words that the outcome's reason holds
-    wrinkled: bool = False  # whether the true film loses its hoop tension on the way
-    fit: Fit | None = None
+    status: Literal["complete", "limit", "fault", "cut short"] = Field(description="How the run ended.")
+    reason: str = Field(default="", description="Words that the outcome's reason holds.")
+    wrinkled: bool = Field(default=False, description="Whether the true film loses its hoop tension on the way.")
+    fit: Fit | None = Field(default=None, description="How near an identification must come. Absent: none is made.")
 
 
 class Fixture(Table):
     """One ``fixture.toml``."""
 
-    title: str
-    killed_at_s: float | None = Field(default=None, gt=0)  # of the plan: what was on disk then is the log
-    truth: Truth
-    expected: Expected
+    title: str = Field(description="What the fixture shows.")
+    killed_at_s: float | None = Field(
+        default=None, gt=0, description="At this time of the plan (s) what was on disk is the log. Absent: at the end."
+    )
+    truth: Truth = Field(description="The film behind it.")
+    expected: Expected = Field(description="What must come out of the log.")
 
 
 def names() -> list[str]:

@@ -17,7 +17,15 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 ENTRY_POINTS = "dea_rig.commands"
-HELPERS = {"app", "files", "import_options", "running", "show", "talk"}  # modules of this package that are no commands
+HELPERS = {  # modules of this package that are no commands
+    "app",
+    "files",
+    "import_options",
+    "running",
+    "show",
+    "talk",
+    "topics",
+}
 EXIT_CODES = """Exit codes: 0 done; 1 failed; 2 a file or option cannot be used, nothing was touched; 3 a limit;
 4 a fault of the rig; 130 stopped by the operator."""
 
@@ -53,10 +61,17 @@ class Commands(click.Group):
             code = _exit_code(error)
             if code is None:
                 raise
-            click.secho(str(error), err=True, fg="red")
+            click.secho(_plain(error), err=True, fg="red")
             for note in getattr(error, "__notes__", []):
-                click.echo(note, err=True)
+                click.echo(_plain(note), err=True)
             ctx.exit(code)
+
+
+def _plain(text: object) -> str:
+    """What is told, without anything that could drive the terminal: it may quote a file or a device."""
+    from rig.base.text import printable
+
+    return printable(str(text), keep="\n")
 
 
 def _own() -> dict[str, str]:

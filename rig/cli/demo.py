@@ -39,7 +39,7 @@ def command(out: Path | None, seed: int) -> None:
 
     folder = _make_folder(out)
     with as_file(files("sim_fixtures")) as fixtures:
-        for name in ("scenes", "protocols", "calibrations"):
+        for name in ("scenes", "protocols", "calibrations", "schema"):
             shutil.copytree(fixtures / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     logs = []
     for number, name in enumerate(SCENES):

@@ -25,9 +25,9 @@ NAMES = {
 
 def show(*tables: RenderableType) -> None:
     """Print to standard output; as wide as the terminal, at least 100 columns where there is none."""
-    console = Console()
+    console = Console(markup=False, emoji=False)  # texts may come from files
     if not console.is_terminal:
-        console = Console(width=max(console.width, 120))
+        console.width = max(console.width, 120)
     for table in tables:
         console.print(table)
 

@@ -30,9 +30,13 @@ Quantity = Literal["radial_stress", "hoop_stress", "field"]
 class FilmTable(Table):
     """What all films of the study share."""
 
-    ring_radius_mm: Positive = 20.0
-    thickness_um: Positive = 40.0
-    material: AnyMaterial = "parker-cao2018"
+    ring_radius_mm: Positive = Field(default=20.0, description="Inner radius of the ring (mm). Typical: 10 to 60.")
+    thickness_um: Positive = Field(
+        default=40.0, description="Thickness of the film (um) before pre-stretch. Typical: 20 to 1000."
+    )
+    material: AnyMaterial = Field(
+        default="parker-cao2018", description="The film: the name of a known material, or a table [film.material]."
+    )
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -62,29 +66,39 @@ class FilmTable(Table):
 class SpringTable(Table):
     """Case I: ``B = F0 - K h``."""
 
-    preload_N: Positive = 0.8
-    stiffness_N_per_mm: Positive = 0.05
+    preload_N: Positive = Field(
+        default=0.8, description="Force F0 of the spring at displacement 0 (N). Typical: 0.1 to 5."
+    )
+    stiffness_N_per_mm: Positive = Field(
+        default=0.05, description="Stiffness K of the spring (N/mm). Typical: 0.01 to 1."
+    )
 
 
 class MassTable(Table):
     """Case II: ``B = M g``."""
 
-    weight_N: Positive = 0.25
+    weight_N: Positive = Field(default=0.25, description="Weight of the mass (N), M g. Typical: 0.05 to 5.")
 
 
 class AntagonistTable(Table):
     """Case III: a second cone of the same film; the two displacements add up to the spacer."""
 
-    spacer_mm: Positive = 20.0
-    voltage_V: float = 0.0
+    spacer_mm: Positive = Field(
+        default=20.0, description="Length of the spacer between the two cones (mm). Typical: 5 to 40."
+    )
+    voltage_V: float = Field(default=0.0, description="Voltage on the second cone (V).")
 
 
 class BiasTables(Table):
     """The three biases; Table 1 of the paper when left out."""
 
-    spring: SpringTable = SpringTable()
-    mass: MassTable = MassTable()
-    antagonist: AntagonistTable = AntagonistTable()
+    spring: SpringTable = Field(
+        default=SpringTable(), description="Case I, a spring; Table 1 of the paper when left out."
+    )
+    mass: MassTable = Field(default=MassTable(), description="Case II, a mass; Table 1 of the paper when left out.")
+    antagonist: AntagonistTable = Field(
+        default=AntagonistTable(), description="Case III, a second cone; Table 1 of the paper when left out."
+    )
 
     def recipes(self, cases: list[Case]) -> dict[str, Recipe]:
         """Of the cases wanted, in SI units."""
@@ -99,9 +113,15 @@ class BiasTables(Table):
 class LimitsTable(Table):
     """What ends a stroke; the material's own strength and largest stretch when left out."""
 
-    field_V_per_um: Positive | None = None
-    stretch: float | None = Field(default=None, gt=1.0)
-    voltage_V: Positive | None = None
+    field_V_per_um: Positive | None = Field(
+        default=None, description="Field at which a stroke ends (V/um). Absent: the material's strength."
+    )
+    stretch: float | None = Field(
+        default=None,
+        gt=1.0,
+        description="Stretch at which a stroke ends, pre-stretch included. Absent: the material's largest stretch.",
+    )
+    voltage_V: Positive | None = Field(default=None, description="Voltage at which a stroke ends (V). Absent: none.")
 
     def criteria(self, material: Material) -> Criteria:
         """In SI units.
@@ -121,30 +141,53 @@ class LimitsTable(Table):
 class ProfilesStudy(Table):
     """Stress and field from disk to ring of some films (figures 5 and 6)."""
 
-    study: Literal["profiles"]
-    title: str = ""
-    film: FilmTable = FilmTable()
-    disk_radii_mm: list[Positive] = Field(min_length=1, max_length=20)
-    prestretch: Stretch = 1.2
-    displacement_mm: Positive = 10.0
-    voltages_V: list[Annotated[float, Field(ge=0)]] = Field(min_length=1, max_length=20)
-    show: list[Quantity] = Field(min_length=1, max_length=3)
-    wrinkling: Literal["plain", "tension_field"] = "plain"
+    study: Literal["profiles"] = Field(description="Kind of the study.")
+    title: str = Field(default="", description="What the study shows, for its pictures.")
+    film: FilmTable = Field(default=FilmTable(), description="What all films of the study share.")
+    disk_radii_mm: list[Positive] = Field(
+        min_length=1, max_length=20, description="Radii of the disks (mm), one film each."
+    )
+    prestretch: Stretch = Field(default=1.2, description="Equibiaxial pre-stretch; 1 is none. Typical: 1.05 to 4.")
+    displacement_mm: Positive = Field(default=10.0, description="Displacement of the disk (mm).")
+    voltages_V: list[Annotated[float, Field(ge=0)]] = Field(
+        min_length=1, max_length=20, description="Voltages (V), one curve each."
+    )
+    show: list[Quantity] = Field(min_length=1, max_length=3, description="Which quantities are drawn.")
+    wrinkling: Literal["plain", "tension_field"] = Field(
+        default="plain",
+        description='"plain": the membrane equations as they are; "tension_field": folded zones carry no hoop stress.',
+    )
 
 
 class MapStudy(Table):
     """Largest stroke and work over a/b and pre-stretch (figures 7 and 8)."""
 
-    study: Literal["map"]
-    title: str = ""
-    film: FilmTable = FilmTable()
-    disk_radii_mm: list[Positive] = Field(min_length=1, max_length=200)
-    prestretches: list[Stretch] = Field(min_length=1, max_length=50)
-    cases: list[Case] = Field(default=list(get_args(Case)), min_length=1, max_length=3)
-    treatments: list[TreatmentName] = Field(default=list(get_args(TreatmentName)), min_length=1, max_length=3)
-    bias: BiasTables = BiasTables()
-    limits: LimitsTable = LimitsTable()
-    claims: Literal["cao2018"] | None = None
+    study: Literal["map"] = Field(description="Kind of the study.")
+    title: str = Field(default="", description="What the study shows, for its pictures.")
+    film: FilmTable = Field(default=FilmTable(), description="What all films of the study share.")
+    disk_radii_mm: list[Positive] = Field(
+        min_length=1, max_length=200, description="Radii of the disks (mm), one film each."
+    )
+    prestretches: list[Stretch] = Field(
+        min_length=1, max_length=50, description="Equibiaxial pre-stretches; 1 is none."
+    )
+    cases: list[Case] = Field(
+        default=list(get_args(Case)),
+        min_length=1,
+        max_length=3,
+        description="Biases: I spring, II mass, III second cone.",
+    )
+    treatments: list[TreatmentName] = Field(
+        default=list(get_args(TreatmentName)),
+        min_length=1,
+        max_length=3,
+        description='Lost tension: "plain" ignores it, "tension" ends the stroke there, "tension_field" has folds.',
+    )
+    bias: BiasTables = Field(default=BiasTables(), description="The biases; Table 1 of the paper when left out.")
+    limits: LimitsTable = Field(default=LimitsTable(), description="What ends a stroke.")
+    claims: Literal["cao2018"] | None = Field(
+        default=None, description="Whose claims are held against the maps. Absent: none."
+    )
 
     @model_validator(mode="after")
     def _claims_have_their_numbers(self) -> Self:
@@ -160,17 +203,22 @@ class MapStudy(Table):
 class BoundaryStudy(Table):
     """Film curves, bias line and breakdown boundary (the paper's supplement, figure S2)."""
 
-    study: Literal["boundary"]
-    title: str = ""
-    film: FilmTable = FilmTable()
-    disk_radius_mm: Positive = 4.0
-    prestretch: Stretch = 1.2
-    voltages_V: list[Annotated[float, Field(ge=0)]] = Field(min_length=1, max_length=20)
-    highest_mm: Positive = 16.0
-    case: Case = "I"
-    bias: BiasTables = BiasTables()
-    limits: LimitsTable = LimitsTable()
-    wrinkling: Literal["plain", "tension_field"] = "plain"
+    study: Literal["boundary"] = Field(description="Kind of the study.")
+    title: str = Field(default="", description="What the study shows, for its pictures.")
+    film: FilmTable = Field(default=FilmTable(), description="What all films of the study share.")
+    disk_radius_mm: Positive = Field(default=4.0, description="Radius of the disk (mm).")
+    prestretch: Stretch = Field(default=1.2, description="Equibiaxial pre-stretch; 1 is none. Typical: 1.05 to 4.")
+    voltages_V: list[Annotated[float, Field(ge=0)]] = Field(
+        min_length=1, max_length=20, description="Voltages (V), one curve each."
+    )
+    highest_mm: Positive = Field(default=16.0, description="Largest displacement that is drawn (mm).")
+    case: Case = Field(default="I", description="Bias: I spring, II mass, III second cone.")
+    bias: BiasTables = Field(default=BiasTables(), description="The biases; Table 1 of the paper when left out.")
+    limits: LimitsTable = Field(default=LimitsTable(), description="What ends a stroke.")
+    wrinkling: Literal["plain", "tension_field"] = Field(
+        default="plain",
+        description='"plain": the membrane equations as they are; "tension_field": folded zones carry no hoop stress.',
+    )
 
 
 Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
@@ -179,13 +227,21 @@ Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 class BoundsTable(Table):
     """Lowest and highest value of what may be varied; a variable left out stays as the study has it."""
 
-    radius_ratio: Range | None = None
-    prestretch: Range | None = None
-    thickness_um: Range | None = None
-    preload_N: Range | None = None
-    stiffness_N_per_mm: Range | None = None
-    weight_N: Range | None = None
-    spacer_mm: Range | None = None
+    radius_ratio: Range | None = Field(
+        default=None, description="Lowest and highest radius of the disk over that of the ring."
+    )
+    prestretch: Range | None = Field(default=None, description="Lowest and highest pre-stretch.")
+    thickness_um: Range | None = Field(
+        default=None, description="Lowest and highest thickness of the film (um) before pre-stretch."
+    )
+    preload_N: Range | None = Field(
+        default=None, description="Lowest and highest force of the spring at displacement 0 (N)."
+    )
+    stiffness_N_per_mm: Range | None = Field(
+        default=None, description="Lowest and highest stiffness of the spring (N/mm)."
+    )
+    weight_N: Range | None = Field(default=None, description="Lowest and highest weight (N).")
+    spacer_mm: Range | None = Field(default=None, description="Lowest and highest length of the spacer (mm).")
 
     def si(self) -> dict[str, tuple[float, float]]:
         """By the model's names, in SI units."""
@@ -211,21 +267,28 @@ VARIABLES = {  # key: name in the model, SI units in one unit of the key
 class OptimiseStudy(Table):
     """The best actuator of one case within bounds, and the front of stroke against work."""
 
-    study: Literal["optimise"]
-    title: str = ""
-    film: FilmTable = FilmTable()
-    case: Case = "I"
-    disk_radius_mm: Positive = 4.0
-    prestretch: Stretch = 1.2
-    treatment: TreatmentName = "tension"
-    vary: BoundsTable
-    bias: BiasTables = BiasTables()
-    limits: LimitsTable = LimitsTable()
-    start: int = Field(default=64, ge=4, le=4096)
-    front: int = Field(default=5, ge=0, le=100)
-    # What `dea-rig fit -o` wrote: its material takes the film's place, and its uncertainties make the optimum robust.
-    fit: str | None = None
-    coverage: float = Field(default=2.0, gt=0.0, le=6.0)
+    study: Literal["optimise"] = Field(description="Kind of the study.")
+    title: str = Field(default="", description="What the study shows, for its pictures.")
+    film: FilmTable = Field(default=FilmTable(), description="What all films of the study share.")
+    case: Case = Field(default="I", description="Bias: I spring, II mass, III second cone.")
+    disk_radius_mm: Positive = Field(default=4.0, description="Radius of the disk (mm).")
+    prestretch: Stretch = Field(default=1.2, description="Equibiaxial pre-stretch; 1 is none. Typical: 1.05 to 4.")
+    treatment: TreatmentName = Field(
+        default="tension",
+        description='Lost tension: "plain" ignores it, "tension" ends the stroke there, "tension_field" has folds.',
+    )
+    vary: BoundsTable = Field(description="What may be varied, between which bounds.")
+    bias: BiasTables = Field(default=BiasTables(), description="The biases; Table 1 of the paper when left out.")
+    limits: LimitsTable = Field(default=LimitsTable(), description="What ends a stroke.")
+    start: int = Field(default=64, ge=4, le=4096, description="Points at which the search begins.")
+    front: int = Field(default=5, ge=0, le=100, description="Points on the front of stroke against work; 0: none.")
+    fit: str | None = Field(
+        default=None,
+        description="Result of `dea-rig fit -o`, as seen from the study: its film is taken, robustly.",
+    )
+    coverage: float = Field(
+        default=2.0, gt=0.0, le=6.0, description="How many standard uncertainties of the fit the optimum must bear."
+    )
 
 
 Study = ProfilesStudy | MapStudy | BoundaryStudy | OptimiseStudy

@@ -25,6 +25,11 @@ class Protocol(Table):
     """A titled list of steps."""
 
     title: str = Field(default="", description="What the protocol is for; it stands over tables and in the log.")
+    accept: list[str] = Field(
+        default_factory=list,
+        max_length=50,
+        description='Keys whose unusual values are meant, by name: ["step.threshold_mN"].',
+    )
     step: list[AnyStep] = Field(min_length=1, max_length=1000, description="The steps, in order: [[step]] tables.")
 
 
