@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from model.specimen import Specimen
 
+from calibration.film.assumed import assumed_uncertainties
+
 Array = NDArray[np.float64]
 
 HELD = 2.0  # times its noise: a displacement that scatters no more did not move
@@ -25,9 +27,12 @@ UNCERTAINTIES = (
     "displacement_zero",
     "displacement_gain",
     "voltage_gain",
+    "displacement_axis",
+    "voltage_at_film",
     "thickness_uncertainty",
     "prestretch_uncertainty",
     "disk_radius_uncertainty",
+    "ring_radius_uncertainty",
     "compliance_uncertainty",
     "eccentricity",
     "lag_uncertainty",
@@ -67,9 +72,15 @@ class Curve:
         Relative standard uncertainties of the instruments' gains; the same error in all curves of a fit.
     force_zero, displacement_zero : float
         Standard uncertainties of the zeros that were taken off (N, m); the same error in all curves of a run.
-    thickness_uncertainty, prestretch_uncertainty, disk_radius_uncertainty : float
-        Relative standard uncertainties of the specimen's own dimensions; taken as the same error in all curves of a
-        fit (films of one batch, one punch), which is the cautious choice.
+    displacement_axis, voltage_at_film : float, optional
+        Relative standard uncertainties of what no certificate knows: the cosine between sensor and stage, what leads
+        and electrodes lose. The same error in all curves of a fit. Where they are not given they are assumed
+        (`calibration.film.assumed`); 0 means exact.
+    thickness_uncertainty, prestretch_uncertainty, disk_radius_uncertainty, ring_radius_uncertainty : float, optional
+        Relative standard uncertainties of the specimen's own dimensions, assumed where they are not given; 0 means
+        exact. Which specimens share an error: see `part`.
+    batch : str
+        The sheet that the film was cut from: specimens of one batch share the error of their thickness.
     compliance_uncertainty : float
         Standard uncertainty of the rig's compliance (m/N) where ``h`` is the stage's way, already corrected by the
         compliance that is believed; 0 where a sensor on the disk measures ``h``. One rig: the same in all curves.
@@ -82,6 +93,8 @@ class Curve:
         When each sample was taken, on the clock of its run (s). With it a viscous film can be told from other errors.
     flagged : ndarray of bool, shape (n,), optional
         Samples that an instrument itself called bad.
+    assumed : frozenset of str
+        Which uncertainties nobody stated; it is filled in here.
     """
 
     label: str
@@ -99,14 +112,19 @@ class Curve:
     displacement_zero: float = 0.0
     displacement_gain: float = 0.0
     voltage_gain: float = 0.0
-    thickness_uncertainty: float = 0.0
-    prestretch_uncertainty: float = 0.0
-    disk_radius_uncertainty: float = 0.0
+    displacement_axis: float | None = None
+    voltage_at_film: float | None = None
+    thickness_uncertainty: float | None = None
+    prestretch_uncertainty: float | None = None
+    disk_radius_uncertainty: float | None = None
+    ring_radius_uncertainty: float | None = None
+    batch: str = ""
     compliance_uncertainty: float = 0.0
     eccentricity: float = 0.0
     lag_uncertainty: float = 0.0
     time: Array | None = None
     flagged: NDArray[np.bool_] | None = None
+    assumed: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         n = np.size(self.h)
@@ -131,6 +149,12 @@ class Curve:
                 f"curve {self.label!r}: force_noise is {self.force_noise} N; it must be positive, for it is the weight "
                 "of every sample. The certificate of the force sensor states it"
             )
+        usual = assumed_uncertainties(self.specimen)
+        silent = {name for name in usual if getattr(self, name) is None}
+        for name in silent:
+            object.__setattr__(self, name, usual[name])
+        still = {name for name in self.assumed if getattr(self, name) == usual.get(name)}  # after dataclasses.replace
+        object.__setattr__(self, "assumed", frozenset(silent | still))
         for name in UNCERTAINTIES:
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:
@@ -141,6 +165,21 @@ class Curve:
         """Samples that have all three values and no flag of an instrument; shape (n,)."""
         usable: NDArray[np.bool_] = np.isfinite(self.h) & np.isfinite(self.force) & np.isfinite(self.voltage)
         return usable if self.flagged is None else usable & ~self.flagged
+
+    def part(self, dimension: str) -> str:
+        """Whose ``dimension`` it is: curves that name the same part share its error.
+
+        The thickness is that of the batch, or else of the specimen, and the pre-stretch that of the specimen; disks and
+        rings are told apart by their radii.
+        """
+        s = self.specimen
+        if dimension == "disk_radius":
+            return f"the disk of {1e3 * s.disk_radius:g} mm"
+        if dimension == "ring_radius":
+            return f"the ring of {1e3 * s.ring_radius:g} mm"
+        if dimension == "thickness" and self.batch:
+            return f"batch {self.batch}"
+        return s.name or f"the specimen of {1e6 * s.thickness:g} um on a disk of {1e3 * s.disk_radius:g} mm"
 
     @cached_property
     def place(self) -> Array:

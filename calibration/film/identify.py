@@ -39,6 +39,7 @@ from calibration.film.propagation import secant_modulus
 from calibration.film.reduction import Selection, select
 from calibration.film.result import Identification
 from calibration.film.summary import summarise
+from calibration.film.suspects.registry import fittable
 from model.material.materials import Material
 from model.membrane.solve import Wrinkling
 
@@ -64,6 +65,8 @@ def identify(
     wrinkling: Wrinkling = "plain",
     near: Sequence[Material] = (),
     reach: float = math.inf,
+    along: Sequence[str] = (),
+    fixed_stretch: tuple[float, float] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Identification:
     """Fit an Ogden film to force-displacement curves.
@@ -90,6 +93,12 @@ def identify(
         Further starting points, of at most as many terms.
     reach : float
         Largest displacement (m) that the rig may go to; no advice goes beyond.
+    along : sequence of str
+        Errors to be fitted along, run by run, within the size that usually occurs: "eps-stretch", "zero-drift",
+        "softening", "voltage-loss" (`calibration.film.suspects.registry.fittable`).
+    fixed_stretch : (float, float), optional
+        Meridional and hoop stretch of the quantity ``stiffness_fixed``; if it is left out, 1.25 times the pre-stretch,
+        and the pre-stretch.
     provenance : mapping, optional
         Whatever identifies the data (hashes of logs, names of files), as plain JSON values; kept in the result.
 
@@ -108,6 +117,12 @@ def identify(
     if not curves:
         raise IdentificationError("there are no curves")
 
+    choice = fittable()
+    strange = [key for key in along if key not in choice]
+    if strange:
+        raise IdentificationError(f"cannot fit {', '.join(strange)} along; what can be is {', '.join(sorted(choice))}")
+    asked = [choice[key] for key in dict.fromkeys(along)]
+
     guess = curves[0].specimen.material
     if "eps_r" in held:
         guess = replace(guess, eps_r=held["eps_r"])
@@ -117,14 +132,23 @@ def identify(
     nodes = NODES
     for number in range(PASSES):
         if number == 0:
-            coarse = Problem(curves, selections, terms, material, tolerance=SEARCH_TOLERANCE, wrinkling=wrinkling)
+            coarse = Problem(
+                curves, selections, terms, material, tolerance=SEARCH_TOLERANCE, wrinkling=wrinkling, along=asked
+            )
             points = starting_materials(material, terms, starts, seed, held, negative_exponents)
             points += [spread(one, terms) for one in near]
             fits = search(coarse, scaled(points, curves), held)
             best = representative(fits)
             material = coarse.film(best.x)
         problem = Problem(
-            curves, selections, terms, material, nodes=nodes, wrinkling=wrinkling, compliance=best.compliance
+            curves,
+            selections,
+            terms,
+            material,
+            nodes=nodes,
+            wrinkling=wrinkling,
+            compliance=best.compliance,
+            along=asked,
         )
         best = polish(problem, best, held) or best
         material = problem.film(best.x)
@@ -140,10 +164,17 @@ def identify(
     notes += other_minima(fits)
     record = {
         "data": dict(provenance or {}),
-        "settings": {"terms": terms, "starts": starts, "seed": seed, "fixed": held, "wrinkling": wrinkling},
+        "settings": {
+            "terms": terms,
+            "starts": starts,
+            "seed": seed,
+            "fixed": held,
+            "wrinkling": wrinkling,
+            "along": [*along],
+        },
         "software": {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")},
     }
-    return summarise(best, fits, held, notes, record, profiles=profiles, reach=reach)
+    return summarise(best, fits, held, notes, record, profiles=profiles, reach=reach, fixed_stretch=fixed_stretch)
 
 
 def _too_coarse(problem: Problem, x: Array) -> bool:

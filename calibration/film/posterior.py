@@ -23,6 +23,7 @@ from calibration.film.problem import IdentificationError, Problem
 from calibration.film.propagation import secant_modulus
 from calibration.film.reduction import select
 from calibration.film.result import Identification, Posterior, Sampled
+from calibration.film.suspects.registry import fittable
 
 Array = NDArray[np.float64]
 
@@ -66,9 +67,13 @@ def posterior(
     selections = select(curves, found.material, found.wrinkling)
     rig = found.nuisance.get("compliance of the rig")
     compliance = 0.0 if rig is None else rig.value
-    problem = Problem(curves, selections, found.terms, found.material, wrinkling=found.wrinkling, compliance=compliance)
+    settings = found.provenance.get("settings", {})
+    along = [fittable()[key] for key in settings.get("along", [])]
+    problem = Problem(
+        curves, selections, found.terms, found.material, wrinkling=found.wrinkling, compliance=compliance, along=along
+    )
     best = problem.vector(found.material)
-    held = found.provenance.get("settings", {}).get("fixed", {})
+    held = settings.get("fixed", {})
     free = np.array([name not in held for name in problem.names])
     low, high = (side[free] for side in problem.bounds(best))
     rng = np.random.default_rng(seed)

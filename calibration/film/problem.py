@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.film.assumed import UNKNOWN_CORRELATION
 from calibration.film.curve import Curve
 from calibration.film.reduction import (
     Block,
@@ -21,6 +22,7 @@ from calibration.film.reduction import (
     reduce,
     reference_voltage,
 )
+from calibration.film.suspects.base import Context, Kind
 from model.material.materials import Material
 from model.membrane.solve import Wrinkling, solve_many
 from model.specimen import Specimen
@@ -33,6 +35,13 @@ TOLERANCE = 1e-7  # of the membrane solution, relative; far below any noise, so 
 SHARE_BOUNDS = (1e-6, 100.0)  # positive: so is every mu_n alpha_n, which makes the film stable at any stretch
 EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
 PERMITTIVITY_BOUNDS = (0.5, 200.0)
+# Dimensions of a specimen, and the field of a curve with their relative standard uncertainty.
+DIMENSIONS = {
+    "thickness": "thickness_uncertainty",
+    "prestretch": "prestretch_uncertainty",
+    "disk_radius": "disk_radius_uncertainty",
+    "ring_radius": "ring_radius_uncertainty",
+}
 INVALID_RESIDUAL = 1e8  # where the membrane has no state; larger than any real residual
 
 
@@ -42,12 +51,17 @@ class IdentificationError(ValueError):
 
 @dataclass(frozen=True)
 class Nuisance:
-    """An error of the rig that is fitted along: what kind, of which run, its prior standard uncertainty, which rows."""
+    """An error that is fitted along: what kind, of which run, its prior standard uncertainty, which rows.
 
-    kind: str  # force_zero, displacement_zero, lag or compliance
+    One of a dimension is a contrast between specimens: by how much (relative, for one prior) it changes the dimension
+    in each of its rows, is in ``weights``.
+    """
+
+    kind: str  # force_zero, displacement_zero, lag, compliance or one of DIMENSIONS
     run: str
     prior: float
     rows: tuple[int, ...]
+    weights: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +105,7 @@ class Problem:
         tolerance: float = TOLERANCE,
         wrinkling: Wrinkling = "plain",
         compliance: float = 0.0,
+        along: Sequence[Kind] = (),
     ) -> None:
         self.curves = curves
         self.selections = selections
@@ -99,17 +114,18 @@ class Problem:
         self.scale = at.shear_modulus
         self.tolerance = tolerance
         self.wrinkling: Wrinkling = wrinkling
+        self.along = {kind.key: kind for kind in along}
         self.solved = 0
-        self.parts = [(i, part) for i, selection in enumerate(selections) for part in selection.parts]
-        self.active = [i for i, _ in self.parts]
+        self.pieces = [(i, part) for i, selection in enumerate(selections) for part in selection.parts]
+        self.active = [i for i, _ in self.pieces]
         if not self.active:
             raise IdentificationError(
                 "no sample is left to fit: "
                 + "; ".join(_why_empty(c, s) for c, s in zip(curves, selections, strict=True))
             )
         self.electric = any(curves[i].nominal_voltage != 0.0 for i in self.active)
-        self.nodes = np.array([chebyshev_nodes(part.low, part.high, nodes) for _, part in self.parts])
-        self.voltage = np.array([reference_voltage(curves[i], part.used) for i, part in self.parts])
+        self.nodes = np.array([chebyshev_nodes(part.low, part.high, nodes) for _, part in self.pieces])
+        self.voltage = np.array([reference_voltage(curves[i], part.used) for i, part in self.pieces])
         self.nuisances = self._nuisances()
         self.names = [f"g{n + 1}" for n in range(terms)] + [f"alpha{n + 1}" for n in range(terms)]
         self.names += ["eps_r"] if self.electric else []
@@ -121,13 +137,13 @@ class Problem:
         for k, one in enumerate(self.nuisances, start=self.film_parameters):
             x[k] = compliance / one.prior if one.kind == "compliance" else 0.0
         for _ in range(COMPLIANCE_ROUNDS if x[self.film_parameters :].any() else 1):
-            states = self._solve([at], self._shift(x[None]))[0]
+            states = self._solve([at], x[None])[0]
             self._give = states.force
         if not np.isfinite(states.force).all():
             raise IdentificationError("the membrane has no state at the starting guess, where its status says it has")
         self.blocks: list[Block] = []
         self.block_rows: list[int] = []
-        for row, (i, part) in enumerate(self.parts):
+        for row, (i, part) in enumerate(self.pieces):
             model = NodeModel(states.force[row], states.by["h"][row], states.by["voltage"][row])
             new = reduce(curves[i], part.used, self.nodes[row], float(self.voltage[row]), model)
             self.blocks += new
@@ -144,6 +160,7 @@ class Problem:
         self._target = np.concatenate([block.target for block in self.blocks]) / math.sqrt(self.inflation)
         self._stiffness = states.by["h"]  # N/m, at the nodes
         self._late = {k: self._by_lag(one) for k, one in enumerate(self.nuisances) if one.kind == "lag"}
+        self._late |= self._by_suspects(states)
         self._last: tuple[bytes, Evaluation] | None = None
 
     def _nuisances(self) -> list[Nuisance]:
@@ -162,6 +179,48 @@ class Problem:
         if rows:
             prior = max(self.curves[self.active[row]].compliance_uncertainty for row in rows)
             found.append(Nuisance("compliance", "the rig", prior, rows))
+        for dimension in DIMENSIONS:
+            found += self._contrasts(dimension)
+        runs = dict.fromkeys(self.curves[i].run for i in self.active)
+        found += [Nuisance(key, run, kind.usual, ()) for key, kind in self.along.items() for run in runs]
+        return found
+
+    def parts(self, dimension: str) -> list[str]:
+        """Which parts (films, disks, rings) have errors of their own of a dimension; see `Curve.part`."""
+        return list(dict.fromkeys(self.curves[i].part(dimension) for i in self.active))
+
+    def _correlation(self, dimension: str) -> float:
+        """Of the errors of a dimension of two parts: 0 where each film names its batch, else unknown."""
+        known = dimension == "thickness" and all(self.curves[i].batch for i in self.active)
+        return 0.0 if known else UNKNOWN_CORRELATION
+
+    def common(self, dimension: str) -> float:
+        """Standard deviation of what the errors of a dimension have in common, in units of that of one part.
+
+        Errors ``w`` of K parts with equal correlations c are a common error of variance ``c + (1 - c)/K`` and K - 1
+        contrasts of variance 1 - c. Contrasts are fitted; the common error no data can tell from another film.
+        """
+        c, count = self._correlation(dimension), len(self.parts(dimension))
+        return math.sqrt(c + (1.0 - c) / count)
+
+    def contrasts(self, dimension: str) -> Array:
+        """What the contrasts of a dimension do to each part, in units of its uncertainty; (K, K - 1)."""
+        count = len(self.parts(dimension))
+        base = np.linalg.qr(np.column_stack((np.ones(count), np.eye(count)[:, : count - 1])))[0][:, 1:]
+        found: Array = base * math.sqrt(1.0 - self._correlation(dimension))
+        return found
+
+    def _contrasts(self, dimension: str) -> list[Nuisance]:
+        parts = self.parts(dimension)
+        sizes = [getattr(self.curves[i], DIMENSIONS[dimension]) for i in self.active]
+        if len(parts) == 1 or not any(sizes):
+            return []
+        which = [parts.index(self.curves[i].part(dimension)) for i in self.active]
+        rows = tuple(range(len(self.active)))
+        found = []
+        for k, mode in enumerate(self.contrasts(dimension).T):
+            weights = tuple(float(size * mode[group]) for size, group in zip(sizes, which, strict=True))
+            found.append(Nuisance(dimension, f"contrast {k + 1}", 1.0, rows, weights))
         return found
 
     @property
@@ -223,13 +282,6 @@ class Problem:
         """The model at the nodes, errors of the displacement included and force zeros not."""
         return self._one(x).states[0]
 
-    def at_rest(self, x: Array) -> Array:
-        """The model's force at the nodes at 0 V; where there is none, that at the curves' own voltages."""
-        specimens = np.empty((len(self.active), 1), dtype=np.object_)
-        specimens[:, 0] = [self.curves[i].specimen.with_material(self.film(x)) for i in self.active]
-        force = solve_many(specimens, self.nodes, tolerance=self.tolerance).force
-        return np.where(np.isfinite(force), force, self.states(x).force)
-
     def project(self, at_nodes: Array) -> Array:
         """Weighted residual rows of changes of the force at the nodes, (..., rows, nodes, P); nuisances get 0."""
         rows = [root @ at_nodes[..., row, :, :] for root, row in zip(self.roots, self.block_rows, strict=True)]
@@ -239,7 +291,7 @@ class Problem:
     def evaluate(self, points: Array, *, slopes: bool = True) -> Evaluation:
         """Residuals and Jacobians of many parameter vectors (S, P), their membrane states all solved together."""
         count, data = len(points), self.data_rows
-        solved = self._solve([self.film(x) for x in points], self._shift(points), slopes=slopes)
+        solved = self._solve([self.film(x) for x in points], points, slopes=slopes)
         force = solved.force.copy()
         for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
             if nuisance.kind == "force_zero":
@@ -253,7 +305,7 @@ class Problem:
         if slopes:
             by = self.by_parameters(points[:, None, None], *(solved.by[name] for name in ("mu", "alpha", "eps_r")))
             for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
-                if nuisance.kind != "lag":
+                if k - self.film_parameters not in self._late:
                     by[..., k][:, list(nuisance.rows)] = self._by_nuisance(nuisance, solved)
             jacobian = self.project(by)
             for k, late in self._late.items():
@@ -266,7 +318,7 @@ class Problem:
 
     def samples(self, row: int, x: Array, states: States) -> tuple[Array, Array, Array]:
         """Of the used samples of a row: residual (measured minus model, N), its deviation, displacement."""
-        i, part = self.parts[row]
+        i, part = self.pieces[row]
         curve, used = self.curves[i], part.used
         matrix = interpolation_matrix(self.nodes[row], curve.place[used])
         model = matrix @ states.force[row]
@@ -275,12 +327,65 @@ class Problem:
                 model += value * nuisance.prior
             elif nuisance.kind == "lag" and row in nuisance.rows:
                 model -= value * nuisance.prior * curve.velocity[used] * (matrix @ self._stiffness[row])
+        if self.along:
+            model += self._along_at(row, x)[used]
         reference = float(self.voltage[row])
         if reference > 0.0:
             by_square = states.by["voltage"][row] / (2 * reference)
             model += matrix @ by_square * (curve.voltage[used] ** 2 - reference**2)
         sigma = np.hypot(curve.force_noise, matrix @ states.by["h"][row] * curve.displacement_noise)
         return curve.force[used] - model, sigma, curve.h[used]
+
+    def context(self, x: Array) -> Context:
+        """What the shapes of suspects are made from, at ``x``."""
+        return self._context(self.film(x), self.states(x))
+
+    def _context(self, film: Material, states: States) -> Context:
+        return Context(
+            curves=[self.curves[i] for i in self.active],
+            nodes=self.nodes,
+            voltage=self.voltage,
+            force=states.force,
+            by=states.by,
+            film=film,
+            blocks=self.blocks,
+            block_rows=self.block_rows,
+            project=self.project,
+            residuals=self.data_rows + len(self.nuisances),
+            scale=math.sqrt(self.inflation),
+            wrinkling=self.wrinkling,
+            fitted=frozenset(one.kind for one in self.nuisances),
+        )
+
+    def _by_suspects(self, states: States) -> dict[int, Array]:
+        """What one prior of every error that is fitted along on request does to the weighted data rows, run by run."""
+        if not self.along:
+            return {}
+        context, found = self._context(self.material, states), {}
+        runs = [self.curves[self.active[row]].run for row in self.block_rows]
+        owner = np.repeat(np.array(runs, dtype=np.object_), [root.shape[0] for root in self.roots])
+        for key, kind in self.along.items():
+            shapes = kind.shapes(replace(context, fitted=context.fitted - {key}))
+            if not shapes:
+                raise IdentificationError(f"{kind.name}: these data have nothing to do with it; do not fit it along")
+            for k, one in enumerate(self.nuisances):
+                if one.kind == key:
+                    found[k] = one.prior * shapes[0].rows[: self.data_rows] * (owner == one.run)
+        return found
+
+    def _along_at(self, row: int, x: Array) -> Array:
+        """What the errors that are fitted along on request add to the force of the samples of a row's curve (N)."""
+        curve = self.curves[self.active[row]]
+        change = np.zeros(curve.h.size)
+        places = np.cumsum([0, *(root.shape[0] for root in self.roots)])
+        for k, late in self._late.items():
+            if self.nuisances[k].kind not in self.along:
+                continue
+            for block, begin, end, where in zip(self.blocks, places[:-1], places[1:], self.block_rows, strict=True):
+                if where == row:
+                    part = block.base @ late[begin:end] * math.sqrt(self.inflation) * block.sigma
+                    change[block.rows] += x[self.film_parameters + k] * part
+        return change
 
     def interpolation_error(self, states: States) -> Array:
         """Estimated error (N) of the interpolant of each row: what the last two of its Chebyshev terms amount to."""
@@ -292,6 +397,13 @@ class Problem:
 
     def _by_nuisance(self, nuisance: Nuisance, solved: States) -> Array:
         rows = list(nuisance.rows)
+        if nuisance.kind in DIMENSIONS:
+            size = [
+                weight * getattr(self.curves[self.active[row]].specimen, nuisance.kind)
+                for row, weight in zip(rows, nuisance.weights, strict=True)
+            ]
+            sized: Array = solved.by[nuisance.kind][:, rows] * np.array(size)[:, None]
+            return sized
         if nuisance.kind == "force_zero":
             return np.full((len(solved.force), len(rows), self.nodes.shape[1]), nuisance.prior)
         slope = nuisance.prior * solved.by["h"][:, rows]
@@ -328,19 +440,31 @@ class Problem:
             self._last = (key, self.evaluate(x[None]))
         return self._last[1]
 
-    def _solve(self, materials: Sequence[Material], shift: Array, *, slopes: bool = True) -> States:
+    def _dimensions(self, points: Array) -> dict[str, Array]:
+        """Factors by which the contrasts change the specimens' dimensions, (S, rows), of those that have any."""
+        factors: dict[str, Array] = {}
+        for values, nuisance in zip(points.T[self.film_parameters :], self.nuisances, strict=True):
+            if nuisance.kind in DIMENSIONS:
+                factor = factors.setdefault(nuisance.kind, np.ones((len(points), len(self.active))))
+                factor += values[:, None] * np.array(nuisance.weights)
+        return factors
+
+    def _solve(self, materials: Sequence[Material], points: Array, *, slopes: bool = True) -> States:
         specimens = np.empty((len(materials), len(self.active), 1), dtype=np.object_)
         known: dict[tuple[int, int], Specimen] = {}  # the curves of one specimen share it, so that its numbers are once
+        factors = self._dimensions(points)
         for s, material in enumerate(materials):
             for row, i in enumerate(self.active):
                 here = self.curves[i].specimen
                 key = (s, id(here))
                 if key not in known:
-                    known[key] = here.with_material(material)
+                    known[key] = scaled_specimen(
+                        here.with_material(material), {name: float(one[s, row]) for name, one in factors.items()}
+                    )
                 specimens[s, row, 0] = known[key]
         solved = solve_many(
             specimens,
-            self.nodes + shift,
+            self.nodes + self._shift(points),
             self.voltage[:, None],
             tolerance=self.tolerance,
             wrinkling=self.wrinkling,
@@ -364,6 +488,16 @@ class States:
     def __getitem__(self, index: int) -> States:
         by = {name: values[index] for name, values in self.by.items()}
         return States(self.force[index], by, self.max_stretch[index])
+
+
+def scaled_specimen(specimen: Specimen, factors: Mapping[str, float]) -> Specimen:
+    """The specimen with its dimensions times ``factors``, which stay positive however far a search goes astray."""
+    if not factors:
+        return specimen
+    changed = {name: getattr(specimen, name) * max(factor, 0.1) for name, factor in factors.items()}
+    if changed.get("disk_radius", 0.0) >= changed.get("ring_radius", specimen.ring_radius):
+        return specimen
+    return replace(specimen, **changed)
 
 
 def _why_empty(curve: Curve, selection: Selection) -> str:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.curve import Curve
-from calibration.film.problem import EXPONENT_BOUNDS, Problem
+from calibration.film.misfit import likely
+from calibration.film.problem import DIMENSIONS, EXPONENT_BOUNDS, Problem
 from calibration.film.result import Quantity, RigParameter, Stiffness, Suspect, verdict
 from model.material.materials import Material
 
@@ -21,17 +22,24 @@ Array = NDArray[np.float64]
 SYSTEMATIC = (
     ("force gain", "force_gain", "force"),
     ("displacement gain", "displacement_gain", "h"),
+    ("displacement axis", "displacement_axis", "h"),
     ("voltage gain", "voltage_gain", "voltage"),
+    ("voltage at the film", "voltage_at_film", "voltage"),
     ("thickness", "thickness_uncertainty", "thickness"),
     ("pre-stretch", "prestretch_uncertainty", "prestretch"),
     ("disk radius", "disk_radius_uncertainty", "disk_radius"),
+    ("ring radius", "ring_radius_uncertainty", "ring_radius"),
 )
-
+# Entries of the budget that belong to the specimen: a result "given the dimensions" is without them.
+OF_DIMENSIONS = {"thickness": "thickness", "prestretch": "pre-stretch", "disk_radius": "disk radius"}
+OF_DIMENSIONS |= {"ring_radius": "ring radius"}
 
 # What is fitted along, and its unit.
 NUISANCES = {"force_zero": "N", "displacement_zero": "m", "lag": "s", "compliance": "m/N"}
 # Standard deviation of an exponent of which no more is known than its range (rectangular: JCGM 100:2008, 4.3.7).
 EXPONENT_DEVIATION = (EXPONENT_BOUNDS[1] - EXPONENT_BOUNDS[0]) / math.sqrt(12.0)
+# Meridional stretch over pre-stretch to which a stiffness belongs that can be compared between runs.
+FIXED = 1.25
 NEGLIGIBLE = 1e-3  # of the noise: what is less has no line in a budget
 
 
@@ -107,7 +115,7 @@ class Propagation:
     """Standard uncertainties of functions of the film's parameters, part by part.
 
     ``misfit`` is the chi-square of the lack of fit over its expectation; ``rivals`` are other minima with their
-    likelihood relative to this one; ``doubts`` are imperfections, of which the first biases the result if it is there.
+    likelihood relative to this one; ``doubts`` are imperfections, and those that were found bias the result.
     With ``ranges`` it counts as knowledge that exponents lie in their range. Of an exponent that the data do not
     determine the curvature says far more than is possible, and with it of all that is derived from it.
     """
@@ -131,15 +139,15 @@ class Propagation:
         self.response = self.covariance.response[:, : len(jacobian)]
         self.misfit = misfit
         self.doubts = doubts
-        self.bias: Array | None = None
-        for guilty in doubts[:1]:
-            if guilty.significant:
-                self.bias = self.response @ (guilty.amplitude * guilty.shape)
+        # Each of those that cannot be told apart may be the one: the results may be off by what any of them does.
+        self.biases = [self.response @ (one.amplitude * one.shape) for one in likely(doubts)]
         self.rivals = rivals
         self.effects: dict[str, Array] = {}
         states = problem.states(x)
         for part, uncertainty, scales in SYSTEMATIC:
             relative = np.array([getattr(problem.curves[i], uncertainty) for i in problem.active])[:, None]
+            if scales in DIMENSIONS:
+                relative = relative * problem.common(scales)
             if relative.any():
                 change = states.force if scales == "force" else states.by[scales] * self._size(scales)
                 self.effects[part] = self.response @ problem.project((relative * change)[..., None])[:, 0]
@@ -155,6 +163,20 @@ class Propagation:
         if name == "voltage":
             return self.problem.voltage[:, None]
         return np.array([[getattr(self.problem.curves[i].specimen, name)] for i in self.problem.active])
+
+    def label(self, kind: str) -> str:
+        """The entry of the budget for errors of a kind that are fitted along."""
+        asked = self.problem.along.get(kind)
+        return kind.replace("_", " ") if asked is None else asked.name
+
+    def along(self, gradients: Mapping[str, Array], x: Array) -> dict[str, dict[str, float]]:
+        """By how much each error that was asked to be fitted along shifted functions of x (to first order)."""
+        matrix, found = self.covariance.matrix, {}
+        for k, one in enumerate(self.problem.nuisances, start=self.problem.film_parameters):
+            if one.kind in self.problem.along:
+                name = f"{self.label(one.kind)} of {one.run}"
+                found[name] = {q: float(g @ matrix[:, k] / matrix[k, k] * x[k]) for q, g in gradients.items()}
+        return found
 
     def quantity(
         self, of: Callable[[Material], float], gradient: Array, unit: str, *, at_bound: bool = False, known: bool = True
@@ -174,7 +196,7 @@ class Propagation:
     def unseen(self, gradients: Mapping[str, Array]) -> dict[str, dict[str, float]]:
         """By how much each imperfection may shift functions of x before it would be reported."""
         # The shape is what it would do to the model; the data have it and the model has not.
-        shifts = {one.name: self.response @ (-one.shows_from * one.shape) for one in self.doubts}
+        shifts = {one.name: self.response @ (-one.unseen_size * one.shape) for one in self.doubts}
         return {
             doubt: {name: float(gradient @ shift) for name, gradient in gradients.items()}
             for doubt, shift in shifts.items()
@@ -183,7 +205,7 @@ class Propagation:
     def covariances(self, gradients: Array) -> Array:
         """Covariance matrix of functions of x with these gradients, by all parts that propagate linearly."""
         total: Array = gradients @ self.covariance.matrix @ gradients.T * self.misfit
-        for effect in (*self.effects.values(), *(() if self.bias is None else (self.bias,))):
+        for effect in (*self.effects.values(), *self.biases[:1]):
             change = gradients @ effect
             total = total + np.outer(change, change)
         return total
@@ -193,18 +215,22 @@ class Propagation:
         rows = gradient @ self.covariance.response
         data = self.problem.data_rows
         parts = {"noise": float(np.linalg.norm(rows[:data]))}
-        for kind in NUISANCES:
+        for kind in (*NUISANCES, *self.problem.along):
             mine = [data + k for k, nuisance in enumerate(self.problem.nuisances) if nuisance.kind == kind]
             if mine:
-                parts[kind.replace("_", " ")] = float(np.linalg.norm(rows[mine]))
+                parts[self.label(kind)] = float(np.linalg.norm(rows[mine]))
         unknown = float(np.linalg.norm(rows[self.response.shape[1] :]))
         if unknown > NEGLIGIBLE * parts["noise"]:
             parts["range of exponents"] = unknown
-        bias = 0.0 if self.bias is None else float(gradient @ self.bias)
-        if self.misfit > 1.0 or self.bias is not None:
+        bias = max((abs(float(gradient @ one)) for one in self.biases), default=0.0)
+        if self.misfit > 1.0 or self.biases:
             parts["lack of fit"] = math.hypot(parts["noise"] * math.sqrt(max(0.0, self.misfit - 1.0)), bias)
         for part, effect in self.effects.items():
             parts[part] = abs(float(gradient @ effect))
+        for dimension, part in OF_DIMENSIONS.items():  # what of the differences between specimens was fitted along
+            mine = [data + k for k, nuisance in enumerate(self.problem.nuisances) if nuisance.kind == dimension]
+            if mine:
+                parts[part] = math.hypot(parts.get(part, 0.0), float(np.linalg.norm(rows[mine])))
         return parts
 
 
@@ -223,12 +249,14 @@ class Statement:
     quantities: dict[str, Quantity]
     nuisance: dict[str, RigParameter]
     stretch: tuple[float, float]
+    fixed_stretch: tuple[float, float]  # to which the quantity stiffness_fixed belongs
     stiffness_curve: Stiffness
     along: list[Quantity]  # the same, with their budgets
     parameters: list[str]
     correlation: list[list[float]]
     covariance: list[list[float]]
     condition: float
+    moved: dict[str, dict[str, float]]  # shift of the same by each error that was asked to be fitted along
     unseen: dict[str, dict[str, float]]  # shift of stiffness and permittivity by each suspect that does not show yet
 
 
@@ -242,6 +270,7 @@ def state(
     rivals: Sequence[tuple[Material, float]] = (),
     doubts: Sequence[Suspect] = (),
     ranges: bool = False,
+    fixed_stretch: tuple[float, float] | None = None,
 ) -> Statement:
     """Quantities with uncertainties at ``x``; ``at_bound`` marks entries of x, ``held`` names those that were given.
 
@@ -293,6 +322,11 @@ def state(
     ]
     at = min(range(len(along)), key=lambda k: along[k].relative)
     quantities["stiffness"] = along[at]
+    fixed = (round(FIXED * hoop, 2), hoop) if fixed_stretch is None else fixed_stretch
+    _, fixed_mu, fixed_alpha = secant(mu, alpha, np.array([fixed[0]]), fixed[1])
+    quantities["stiffness_fixed"] = propagation.quantity(
+        partial(secant_modulus, meridional=fixed[0], hoop=fixed[1]), gradient(fixed_mu[0], fixed_alpha[0]), "Pa"
+    )
     quantities["stiffness_end"] = along[-1]
     if problem.electric and "eps_r" not in held:
         slopes["eps_r"] = gradient(zero, zero, 1.0)
@@ -306,18 +340,22 @@ def state(
 
     nuisance = {}
     for k, one in enumerate(problem.nuisances, start=problem.film_parameters):
+        if one.kind in DIMENSIONS:
+            continue
         slope = np.zeros(x.size)
         slope[k] = one.prior
-        nuisance[f"{one.kind.replace('_', ' ')} of {one.run}"] = RigParameter(
+        nuisance[f"{propagation.label(one.kind)} of {one.run}"] = RigParameter(
             value=float(x[k] * one.prior),
             uncertainty=math.hypot(*propagation.budget(slope).values()),
             prior=one.prior,
-            unit=NUISANCES[one.kind],
+            unit=problem.along[one.kind].unit if one.kind in problem.along else NUISANCES[one.kind],
         )
+    nuisance |= _differences(propagation, x)
     return Statement(
         quantities=quantities,
         nuisance=nuisance,
         stretch=(float(stretches[at]), hoop),
+        fixed_stretch=fixed,
         stiffness_curve=Stiffness(
             meridional_stretch=tuple(float(value) for value in stretches),
             hoop_stretch=hoop,
@@ -330,7 +368,30 @@ def state(
         covariance=propagation.covariances(np.array(list(slopes.values()))).tolist(),
         condition=_condition(problem, x, free),
         unseen=derived.unseen(told),
+        moved=propagation.along(told, x),
     )
+
+
+def _differences(propagation: Propagation, x: Array) -> dict[str, RigParameter]:
+    """By how much each specimen's dimensions differ from what they would be if all were wrong alike (relative)."""
+    problem, found = propagation.problem, {}
+    for dimension, label in OF_DIMENSIONS.items():
+        mine = [k for k, one in enumerate(problem.nuisances, problem.film_parameters) if one.kind == dimension]
+        if not mine:
+            continue
+        modes = problem.contrasts(dimension)
+        for part, weights in zip(problem.parts(dimension), modes, strict=True):
+            row = next(row for row, i in enumerate(problem.active) if problem.curves[i].part(dimension) == part)
+            size = float(getattr(problem.curves[problem.active[row]], DIMENSIONS[dimension]))
+            slope = np.zeros(x.size)
+            slope[mine] = size * weights
+            found[f"{label} of {part}"] = RigParameter(
+                value=float(slope @ x),
+                uncertainty=math.hypot(*propagation.budget(slope).values()),
+                prior=float(np.linalg.norm(slope)),
+                unit="1",
+            )
+    return found
 
 
 def _entry(name: str, k: int, film: Material) -> float:

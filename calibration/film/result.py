@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,12 +24,17 @@ IDENTIFIED = 0.05  # relative standard uncertainty up to which a quantity counts
 WEAKLY_IDENTIFIED = 0.30  # ... and as weakly identified
 
 
+GOOD, WEAK = "identified", "weakly identified"
+# Entries of a budget that are of the specimen's dimensions.
+OF_DIMENSIONS = ("thickness", "pre-stretch", "disk radius", "ring radius", "eccentricity")
+
+
 def verdict(relative: float, at_bound: bool) -> str:
     """What a relative standard uncertainty amounts to; a parameter at its bound is not identified at all."""
     if relative <= IDENTIFIED and not at_bound:
-        return "identified"
+        return GOOD
     if relative <= WEAKLY_IDENTIFIED and not at_bound:
-        return "weakly identified"
+        return WEAK
     return "not identifiable from this data"
 
 
@@ -38,8 +43,9 @@ class Quantity:
     """One identified number.
 
     ``uncertainty`` is the combined standard uncertainty (k = 1); ``budget`` holds its independent parts, which add in
-    squares. ``verdict`` is "identified", "weakly identified" or "not identifiable from this data". ``interval`` is the
-    95 % interval by profile likelihood, where one was asked for; an end that the data do not set is infinite.
+    squares. ``verdict`` is "identified", "weakly identified" or "not identifiable from this data"; ``doubt`` says what
+    took a better one away, if anything did. ``interval`` is the 95 % interval by profile likelihood, where one was
+    asked for; an end that the data do not set is infinite.
     """
 
     value: float
@@ -49,6 +55,26 @@ class Quantity:
     verdict: str
     at_bound: bool = False
     interval: tuple[float, float] | None = None
+    doubt: str = ""
+
+    @property
+    def conditional(self) -> float:
+        """Standard uncertainty given the dimensions: as if those of the specimens were exact."""
+        if not math.isfinite(self.uncertainty):
+            return self.uncertainty
+        return math.hypot(*(size for part, size in self.budget.items() if part not in OF_DIMENSIONS))
+
+    @property
+    def conditional_verdict(self) -> str:
+        """The verdict given the dimensions."""
+        relative = self.conditional / abs(self.value) if self.value else math.inf
+        best = verdict(relative, self.at_bound)
+        return WEAK if self.doubt and best == GOOD else best
+
+    def share(self, part: str) -> float:
+        """Part of the variance that an entry of the budget makes up, 0 to 1."""
+        total = self.uncertainty**2
+        return self.budget.get(part, 0.0) ** 2 / total if 0.0 < total < math.inf else 0.0
 
     @property
     def relative(self) -> float:
@@ -69,6 +95,25 @@ class RigParameter:
     uncertainty: float
     prior: float
     unit: str
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The one measurement beside the curves that would help most: of the entry ``part`` of the budget.
+
+    ``now`` and ``then`` are relative standard uncertainties of that input; ``relative`` holds those of the quantities,
+    now and with it. ``assumed`` where nobody stated the input's.
+    """
+
+    part: str
+    now: float
+    then: float
+    assumed: bool
+    relative: dict[str, tuple[float, float]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self) | {"relative": {name: list(pair) for name, pair in self.relative.items()}}
 
 
 @dataclass(frozen=True)
@@ -103,7 +148,7 @@ class Stiffness:
 
 SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
 # Factor and unit in which an amplitude is shown.
-SHOWN = {"1": (100.0, "%"), "m/N": (1e6, "um/N")}
+SHOWN = {"1": (100.0, "%"), "m/N": (1e6, "um/N"), "N": (1e3, "mN"), "m": (1e6, "um"), "s": (1e3, "ms")}
 
 
 @dataclass(frozen=True)
@@ -112,23 +157,35 @@ class Suspect:
 
     ``amplitude`` with its standard ``uncertainty`` is its size in ``unit``; ``probability`` of as much by chance
     counts that several suspects were looked at. From the size ``shows_from`` on, 95 of 100 experiments like this one
-    would report it. ``remedy`` tells how to rule it out, or to find it. ``shape`` is what one unit of it does to the
-    weighted residuals.
+    would report it; infinite where no size would show, because it does to these data what another film does. ``usual``
+    is a size that occurs. ``possible`` is False for a size of the impossible sign. ``part`` is the entry of the
+    uncertainty budget that counts it already, and ``key`` asks for it to be fitted along. ``remedy`` tells how to rule
+    it out, or to find it. ``shape`` is what one unit of it does to the weighted data.
     """
 
     name: str
+    family: str
     amplitude: float
     uncertainty: float
     unit: str
     probability: float
     shows_from: float
+    usual: float
+    possible: bool
+    part: str
+    key: str
     remedy: str
     shape: Array
 
     @property
     def significant(self) -> bool:
         """Whether it is there for all that chance can do."""
-        return self.probability < SIGNIFICANT
+        return self.possible and self.probability < SIGNIFICANT
+
+    @property
+    def unseen_size(self) -> float:
+        """The largest size that may be there unseen; the usual one where no size would show."""
+        return self.shows_from if math.isfinite(self.shows_from) else self.usual
 
     @property
     def words(self) -> str:
@@ -142,7 +199,7 @@ class Suspect:
     def blind(self) -> str:
         """For the operator: up to what size it may be there unseen."""
         factor, unit = SHOWN[self.unit]
-        return f"{self.name} (up to {two_digits(self.shows_from * factor)} {unit})"
+        return f"{self.name} (up to {two_digits(self.unseen_size * factor)} {unit})"
 
 
 @dataclass(frozen=True)
@@ -229,6 +286,12 @@ class Identification:
         ``mu1``, ``alpha1``, ... sorted by exponent, ``G``, ``stiffness`` and, with voltage in the data, ``eps_r``.
     stretch : (float, float)
         Meridional and hoop stretch to which ``stiffness`` belongs; see `secant_modulus`.
+    fixed_stretch : (float, float)
+        The stretches to which ``stiffness_fixed`` belongs: the same for all runs of films with one pre-stretch.
+    assumed : dict of str to float
+        Entries of the budget that nobody stated, with the relative standard uncertainty that was assumed.
+    measurement : Measurement or None
+        What to measure next.
     stiffness_curve : Stiffness
         The same over the range of stretch that the data reach; its last value is the quantity ``stiffness_end``.
     least_tangent : float
@@ -239,6 +302,10 @@ class Identification:
         Of all samples, in their stated standard deviations.
     lack_of_fit, lack_of_fit_freedom, lack_of_fit_probability : float, int, float
         Misfit that smooth curves would not have, in the noise found, and the probability of as much by chance.
+    likely : list of str
+        Names of the suspects that the residuals look like and that these data cannot tell apart, best first.
+    along : dict of str to dict of str to float
+        By how much each error that was asked to be fitted along shifted ``stiffness`` and ``eps_r``.
     suspects : list of Suspect
         Known imperfections whose shape the residuals were held against, most probable first.
     unseen : dict of str to dict of str to float
@@ -265,6 +332,7 @@ class Identification:
     material: Material
     quantities: dict[str, Quantity]
     stretch: tuple[float, float]
+    fixed_stretch: tuple[float, float]
     stiffness_curve: Stiffness
     least_tangent: float
     nuisance: dict[str, RigParameter]
@@ -291,6 +359,10 @@ class Identification:
     provenance: dict[str, Any] = field(default_factory=dict)
     held_out: list[HeldOut] = field(default_factory=list)
     posterior: Posterior | None = None
+    likely: list[str] = field(default_factory=list)
+    along: dict[str, dict[str, float]] = field(default_factory=dict)
+    assumed: dict[str, float] = field(default_factory=dict)
+    measurement: Measurement | None = None
 
     @property
     def terms(self) -> int:
@@ -322,7 +394,7 @@ class Identification:
     def blind_spots(self) -> list[Suspect]:
         """Suspects that may shift stiffness or permittivity by more than their uncertainty before they show.
 
-        The most harmful first.
+        The most harmful first; not those that the uncertainty counts already.
         """
 
         def harm(suspect: Suspect) -> float:
@@ -330,7 +402,7 @@ class Identification:
                 abs(shift) / self.quantities[name].uncertainty for name, shift in self.unseen[suspect.name].items()
             )
 
-        return sorted((one for one in self.suspects if harm(one) > 1.0), key=harm, reverse=True)
+        return sorted((one for one in self.suspects if not one.part and harm(one) > 1.0), key=harm, reverse=True)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dictionaries; a number that is not finite becomes None."""
@@ -341,6 +413,9 @@ class Identification:
             "terms": self.terms,
             "quantities": {name: quantity_dict(q) for name, q in self.quantities.items()},
             "stiffness_at": {"meridional_stretch": self.stretch[0], "hoop_stretch": self.stretch[1]},
+            "stiffness_fixed_at": {"meridional_stretch": self.fixed_stretch[0], "hoop_stretch": self.fixed_stretch[1]},
+            "assumed_not_stated": self.assumed,
+            "most_useful_measurement": None if self.measurement is None else self.measurement.to_dict(),
             "stiffness_curve": {
                 "meridional_stretch": list(self.stiffness_curve.meridional_stretch),
                 "hoop_stretch": self.stiffness_curve.hoop_stretch,
@@ -364,20 +439,25 @@ class Identification:
                 "chi_square": self.lack_of_fit,
                 "degrees_of_freedom": self.lack_of_fit_freedom,
                 "probability": self.lack_of_fit_probability,
+                "likely": self.likely,
                 "suspects": [
                     {
                         "name": one.name,
+                        "family": one.family,
                         "amplitude": one.amplitude,
-                        "standard_uncertainty": one.uncertainty,
+                        "standard_uncertainty": _finite(one.uncertainty),
                         "unit": one.unit,
                         "probability": one.probability,
-                        "shows_from": one.shows_from,
+                        "shows_from": _finite(one.shows_from),
+                        "unseen_size": one.unseen_size,
+                        "counted_in_budget_as": one.part,
                         "shift_unseen": self.unseen[one.name],
                         "remedy": one.remedy,
                     }
                     for one in self.suspects
                 ],
             },
+            "fitted_along": self.along,
             "noise_ratio": self.noise_ratio,
             "samples_per_independent_sample": self.samples_per_independent,
             "samples_used": self.used,
@@ -435,7 +515,11 @@ def quantity_dict(quantity: Quantity) -> dict[str, Any]:
         "standard_uncertainty": _finite(quantity.uncertainty),
         "unit": quantity.unit,
         "budget": {part: _finite(value) for part, value in quantity.budget.items()},
+        "share_of_variance": {part: quantity.share(part) for part in quantity.budget},
+        "standard_uncertainty_given_dimensions": _finite(quantity.conditional),
         "verdict": quantity.verdict,
+        "verdict_given_dimensions": quantity.conditional_verdict,
+        "doubt": quantity.doubt,
         "at_bound": quantity.at_bound,
         "interval_95": None if quantity.interval is None else [_finite(end) for end in quantity.interval],
     }

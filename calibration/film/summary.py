@@ -12,18 +12,31 @@ from numpy.typing import NDArray
 from scipy.special import gammaincc
 
 from calibration.film.identifiability import advice
+from calibration.film.measurement import assumed_parts, most_useful
 from calibration.film.minima import MOST_STEPS, SAME_MINIMUM, Fit
-from calibration.film.misfit import suspects
+from calibration.film.misfit import likely, suspects
 from calibration.film.problem import TOLERANCE, IdentificationError, Problem
 from calibration.film.profile import intervals, targets, widened
 from calibration.film.propagation import determined, least_tangent, state
 from calibration.film.reduction import interpolation_matrix
-from calibration.film.result import IDENTIFIED, SIGNIFICANT, CurveResult, Identification, verdict
+from calibration.film.result import (
+    GOOD,
+    IDENTIFIED,
+    SIGNIFICANT,
+    WEAK,
+    CurveResult,
+    Identification,
+    Quantity,
+    Suspect,
+    verdict,
+)
+from calibration.rounding import percent
 from model.material.materials import Material
 from model.membrane.solve import solve_many
 
 Array = NDArray[np.float64]
 
+UNSEEN = 3.0  # combined standard uncertainties by which an imperfection may shift what counts as identified
 WRONG_MODEL = 9.0  # lack of fit per degree of freedom from which on the model does not describe the data at all
 
 
@@ -36,6 +49,7 @@ def summarise(
     *,
     profiles: bool,
     reach: float,
+    fixed_stretch: tuple[float, float] | None = None,
 ) -> Identification:
     """The result of ``fit``; ``fits`` are the minima from all starting points, best first."""
     problem, x = fit.problem, fit.x
@@ -47,13 +61,26 @@ def summarise(
     misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
     rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits]
     doubts = suspects(problem, x, determined(problem, fit.at_bound, held))
-    stated = state(problem, x, fit.at_bound, held, misfit=misfit, rivals=rivals, doubts=doubts, ranges=True)
+    stated = state(
+        problem,
+        x,
+        fit.at_bound,
+        held,
+        misfit=misfit,
+        rivals=rivals,
+        doubts=doubts,
+        ranges=True,
+        fixed_stretch=fixed_stretch,
+    )
     quantities = stated.quantities
     if profiles or fit.at_bound[: problem.terms].any():  # where a term has vanished, curvature says nothing of it
         aims = targets(problem, stated.stretch, held)
         found = intervals(problem, x, problem.bounds(x), fit.varied, quantities, aims, misfit)
         quantities.update({name: widened(quantities[name], ends, misfit) for name, ends in found.items()})
+    suspected = likely(doubts)
+    quantities.update(doubted(quantities, stated.unseen, doubts, suspected))
     curves = _curve_results(problem, x)
+    used_curves = [problem.curves[i] for i in dict.fromkeys(problem.active)]
     used = sum(curve.used for curve in curves)
     reduced = problem.residual(x)[: problem.data_rows]
     prior = problem.residual(x)[problem.data_rows :]
@@ -65,6 +92,7 @@ def summarise(
         material=replace(problem.film(x), source="identified from force-displacement curves"),
         quantities=quantities,
         stretch=stated.stretch,
+        fixed_stretch=stated.fixed_stretch,
         stiffness_curve=stated.stiffness_curve,
         least_tangent=least_tangent(problem.film(x), stated.stiffness_curve.meridional_stretch[-1], stated.stretch[1]),
         nuisance=stated.nuisance,
@@ -73,6 +101,8 @@ def summarise(
         lack_of_fit=fit.cost,
         lack_of_fit_freedom=misfit_freedom,
         lack_of_fit_probability=probability,
+        likely=[one.name for one in suspected],
+        along=stated.moved,
         suspects=doubts,
         unseen=stated.unseen,
         noise_ratio=math.sqrt(problem.noise_variance),
@@ -89,10 +119,16 @@ def summarise(
         warnings=[],
         advice=[] if held else advice(problem.curves, problem.film(x), stated.quantities, reach),
         provenance=provenance,
+        assumed=assumed_parts(used_curves),
+        measurement=most_useful(quantities, used_curves),
     )
     if misfit > WRONG_MODEL:
-        doubted = {
-            name: replace(quantity, verdict=verdict(max(quantity.relative, 1.01 * IDENTIFIED), quantity.at_bound))
+        lost = {
+            name: replace(
+                quantity,
+                verdict=verdict(max(quantity.relative, 1.01 * IDENTIFIED), quantity.at_bound),
+                doubt="the model misses the data by far more than their noise",
+            )
             for name, quantity in quantities.items()
         }
         notes = [
@@ -100,8 +136,35 @@ def summarise(
             "one film? Fit each alone and compare",
             *notes,
         ]
-        result = replace(result, quantities=doubted)
+        result = replace(result, quantities=lost)
     return replace(result, warnings=[*_warnings(result, problem, fit), *notes])
+
+
+def doubted(
+    quantities: Mapping[str, Quantity],
+    unseen: Mapping[str, Mapping[str, float]],
+    suspects: Sequence[Suspect],
+    found: Sequence[Suspect],
+) -> dict[str, Quantity]:
+    """Quantities that do not count as identified, for all that their uncertainties say.
+
+    Because an imperfection was ``found``; or because one that no entry of the budget counts may be there unseen and
+    shift the quantity by more than `UNSEEN` of its uncertainties.
+    """
+    changed = {}
+    for name, quantity in quantities.items():
+        doubt = f"the data look like {found[0].name}" if found else ""
+        like = "eps_r" if name == "eps_r" else "stiffness"
+        limit = UNSEEN * quantity.uncertainty / abs(quantity.value) if quantity.value else 0.0
+        for suspect in suspects:
+            shift = (
+                abs(unseen.get(suspect.name, {}).get(like, 0.0) / quantities[like].value) if like in quantities else 0.0
+            )
+            if not doubt and not suspect.part and math.isfinite(suspect.shows_from) and shift > limit:
+                doubt = f"{suspect.name} could shift it unseen by {percent(shift)}"
+        if doubt and quantity.verdict == GOOD:
+            changed[name] = replace(quantity, verdict=WEAK, doubt=doubt)
+    return changed
 
 
 def _curve_results(problem: Problem, x: Array) -> list[CurveResult]:
@@ -116,7 +179,7 @@ def _curve_results(problem: Problem, x: Array) -> list[CurveResult]:
         if rows:
             residual, sigma = np.zeros(curve.h.size), np.zeros(curve.h.size)
             for row in rows:
-                used = problem.parts[row][1].used
+                used = problem.pieces[row][1].used
                 residual[used], sigma[used], _ = problem.samples(row, x, states)
             residual, sigma = residual[selection.used], sigma[selection.used]
             direction = curve.direction[selection.used]
@@ -149,7 +212,7 @@ def _curve_results(problem: Problem, x: Array) -> list[CurveResult]:
 
 def _interpolation_errors(problem: Problem, film: Material) -> Array:
     """Largest difference (N) between the interpolant of each row and the model, at its ends and between its nodes."""
-    ends = np.array([[part.low, part.high] for _, part in problem.parts])
+    ends = np.array([[part.low, part.high] for _, part in problem.pieces])
     between = 0.5 * (problem.nodes[:, 1:] + problem.nodes[:, :-1])
     points = np.concatenate((problem.nodes, ends, between), axis=1)
     specimens = np.empty((len(points), 1), dtype=np.object_)
@@ -193,12 +256,17 @@ def _warnings(result: Identification, problem: Problem, fit: Fit) -> list[str]:
             f"give, probability {result.lack_of_fit_probability:.1g}); the uncertainties contain an allowance for it, "
             "but a wrong model has errors that no uncertainty covers"
         )
-    for suspect in result.suspects[:1]:
-        if suspect.significant:
-            words.append(
-                f"the model does not explain the data: the residuals look like {suspect.words}; what that does to the "
-                "results is in their uncertainties"
-            )
+    by_name = {suspect.name: suspect for suspect in result.suspects}
+    if result.likely:
+        named = " or ".join(by_name[name].words for name in result.likely)
+        apart = "; these data cannot tell them apart" if len(result.likely) > 1 else ""
+        words.append(
+            f"the model does not explain the data: the residuals look like {named}{apart}; what that does to the "
+            "results is in their uncertainties"
+        )
+        keys = [key for key in dict.fromkeys(by_name[name].key for name in result.likely) if key]
+        if keys:
+            words.append(f"it can be fitted along: --along {' or --along '.join(keys)}")
     if problem.excess > 1.0:
         words.append(
             f"the samples scatter {result.noise_ratio:.2f} times as much as stated; "

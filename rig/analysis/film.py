@@ -20,7 +20,7 @@ from rig.base.errors import ConfigError, DataError
 from rig.base.outputs import write_text
 from rig.base.toml_file import parse_table
 from rig.log.contents import IN_MEMORY
-from rig.log.dataset import CurveErrors, Run, load_run
+from rig.log.dataset import CurveErrors, Run, SpecimenErrors, load_run
 from rig.scene.scene import Scene
 from rig.scene.specimen import SpecimenTable
 
@@ -264,21 +264,11 @@ def _errors(run: Run, scene: Scene, certificates: Mapping[str, Certificate]) -> 
     return errors_of(scene, certificates)
 
 
-def dimension_errors(dimensions: SpecimenTable) -> CurveErrors:
-    """The uncertainties that a curve has from the dimensions of its specimen."""
-    return {
-        "thickness_uncertainty": dimensions.thickness_uncertainty_um / dimensions.thickness_um,
-        "prestretch_uncertainty": dimensions.prestretch_uncertainty / dimensions.prestretch,
-        "disk_radius_uncertainty": dimensions.disk_radius_uncertainty_mm / dimensions.disk_radius_mm,
-        "eccentricity": dimensions.eccentricity_mm * 1e-3,
-    }
-
-
 def errors_of(scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErrors:
     """Noise and uncertainties of the curves of a scene with these certificates; that of the force must be there."""
     force = certificates["force"]
     errors = CurveErrors(force_noise=force.noise, force_gain=force.gain_uncertainty)
-    errors.update(dimension_errors(scene.specimen))
+    errors.update(dimension_errors(scene.specimen))  # type: ignore[typeddict-item] # a part of its keys
     laser, hv = certificates.get("displacement"), certificates.get("hv")
     if laser is not None:
         errors["displacement_noise"] = laser.noise
@@ -292,6 +282,24 @@ def errors_of(scene: Scene, certificates: Mapping[str, Certificate]) -> CurveErr
     errors["lag_uncertainty"] = math.hypot(*known) if complete else UNKNOWN_LAG
     if hv is not None:
         errors["voltage_gain"] = hv.gain_uncertainty
+    return errors
+
+
+def dimension_errors(dimensions: SpecimenTable) -> SpecimenErrors:
+    """The uncertainties that the table of a specimen states; what it leaves out, the curve assumes."""
+    errors = SpecimenErrors(eccentricity=dimensions.eccentricity_mm * 1e-3, batch=dimensions.batch)
+    if dimensions.thickness_uncertainty_um is not None:
+        errors["thickness_uncertainty"] = dimensions.thickness_uncertainty_um / dimensions.thickness_um
+    if dimensions.prestretch_uncertainty is not None:
+        errors["prestretch_uncertainty"] = dimensions.prestretch_uncertainty / dimensions.prestretch
+    if dimensions.disk_radius_uncertainty_mm is not None:
+        errors["disk_radius_uncertainty"] = dimensions.disk_radius_uncertainty_mm / dimensions.disk_radius_mm
+    if dimensions.ring_radius_uncertainty_mm is not None:
+        errors["ring_radius_uncertainty"] = dimensions.ring_radius_uncertainty_mm / dimensions.ring_radius_mm
+    if dimensions.displacement_axis_uncertainty_percent is not None:
+        errors["displacement_axis"] = dimensions.displacement_axis_uncertainty_percent / 100.0
+    if dimensions.voltage_at_film_uncertainty_percent is not None:
+        errors["voltage_at_film"] = dimensions.voltage_at_film_uncertainty_percent / 100.0
     return errors
 
 

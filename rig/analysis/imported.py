@@ -56,9 +56,9 @@ def read_cones(paths: Sequence[Path], scene: Path, options: ImportOptions) -> Co
     """
     specimen, _ = load_specimen(scene)
     found = read_cone_tables(paths, specimen.specimen(), options)
-    errors = dimension_errors(specimen) | {"lag_uncertainty": UNKNOWN_LAG}
+    errors = dimension_errors(specimen)
     try:
-        return replace(found, curves=[replace(curve, **errors) for curve in found.curves])
+        return replace(found, curves=[replace(curve, lag_uncertainty=UNKNOWN_LAG, **errors) for curve in found.curves])
     except CurveError as error:
         raise DataError(f"{error}.") from None
 

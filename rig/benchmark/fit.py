@@ -172,6 +172,12 @@ def _curves(samples: int, *, zeros: bool = False) -> list[Curve]:
                     force_noise=NOISE_N,
                     force_zero=2e-4 if zeros else 0.0,
                     displacement_zero=5e-6 if zeros else 0.0,
+                    displacement_axis=0.0,  # known, so that every fitter has the same parameters
+                    voltage_at_film=0.0,
+                    thickness_uncertainty=0.0,
+                    prestretch_uncertainty=0.0,
+                    disk_radius_uncertainty=0.0,
+                    ring_radius_uncertainty=0.0,
                 )
             )
     return made

@@ -50,7 +50,20 @@ class Reference(NamedTuple):
     unit: str
 
 
-class CurveErrors(TypedDict, total=False):
+class SpecimenErrors(TypedDict, total=False):
+    """What is known of a specimen; see `calibration.film.curve.Curve`, which assumes what is left out."""
+
+    thickness_uncertainty: float
+    prestretch_uncertainty: float
+    disk_radius_uncertainty: float
+    ring_radius_uncertainty: float
+    displacement_axis: float
+    voltage_at_film: float
+    batch: str
+    eccentricity: float
+
+
+class CurveErrors(SpecimenErrors, total=False):
     """The uncertainties of `calibration.film.curve.Curve`, which explains them."""
 
     force_noise: float  # must be there when a curve is made
@@ -60,11 +73,7 @@ class CurveErrors(TypedDict, total=False):
     displacement_zero: float
     displacement_gain: float
     voltage_gain: float
-    thickness_uncertainty: float
-    prestretch_uncertainty: float
-    disk_radius_uncertainty: float
     compliance_uncertainty: float
-    eccentricity: float
     lag_uncertainty: float
 
 

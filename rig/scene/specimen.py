@@ -75,17 +75,45 @@ class SpecimenTable(Table):
     material: AnyMaterial = Field(
         description="What is believed of the film: the name of a known material, or a table [specimen.material]."
     )
-    disk_radius_uncertainty_mm: NotNegative = Field(
-        default=0.0, description="Standard uncertainty of disk_radius_mm (mm, k = 1); at 0 it counts as exact."
+    batch: str = Field(
+        default="",
+        max_length=64,
+        description="The sheet that the film was cut from, by any name. Specimens of one batch share the error of "
+        'their thickness. Default: "", not known.',
     )
-    thickness_uncertainty_um: NotNegative = Field(
-        default=0.0, description="Standard uncertainty of thickness_um (um, k = 1); at 0 it counts as exact."
+    thickness_uncertainty_um: NotNegative | None = Field(
+        default=None,
+        description="Standard uncertainty (k = 1) of thickness_um, um, before pre-stretch. 0 means exact. Default: "
+        "5 % of the thickness, assumed. Typical: 0.2 to 2.",
     )
-    prestretch_uncertainty: NotNegative = Field(
-        default=0.0, description="Standard uncertainty of prestretch (k = 1); at 0 it counts as exact."
+    prestretch_uncertainty: NotNegative | None = Field(
+        default=None,
+        description="Standard uncertainty (k = 1) of prestretch, in its own unit. 0 means exact. Default: 1 % of the "
+        "pre-stretch, assumed. Typical: 0.002 to 0.02.",
+    )
+    disk_radius_uncertainty_mm: NotNegative | None = Field(
+        default=None,
+        description="Standard uncertainty (k = 1) of disk_radius_mm, mm. 0 means exact. Default: 0.05 mm, assumed.",
+    )
+    ring_radius_uncertainty_mm: NotNegative | None = Field(
+        default=None,
+        description="Standard uncertainty (k = 1) of ring_radius_mm, mm. 0 means exact. Default: 0.05 mm, assumed.",
     )
     eccentricity_mm: NotNegative = Field(
-        default=0.0, description="How far the disk may sit off the ring's centre (mm). Typical: 0 to 0.5."
+        default=0.0,
+        description="How far the disk may sit off the centre of the ring, mm, as a standard uncertainty. Default: 0.",
+    )
+    displacement_axis_uncertainty_percent: NotNegative | None = Field(
+        default=None,
+        description="Standard uncertainty (k = 1) of the displacement beside that of the sensor's certificate, % of "
+        "the reading: the cosine between sensor and stage, and the gain where there is no certificate. 0 means exact. "
+        "Default: 0.5, assumed.",
+    )
+    voltage_at_film_uncertainty_percent: NotNegative | None = Field(
+        default=None,
+        description="Standard uncertainty (k = 1) of the voltage at the film beside that of the supply's certificate, "
+        "% of the reading: losses in leads and electrodes, and the gain where there is no certificate. 0 means exact. "
+        "Default: 1, assumed.",
     )
 
     @model_validator(mode="after")

@@ -18,6 +18,14 @@ GUESS = replace(PARKER, name="guess", mu=(2e4,), alpha=(3.0,), eps_r=3.0)  # far
 
 SPEED = 1e-3  # m/s
 FORCE_NOISE = 5e-3  # N, 0.5 % of 1 N full scale
+EXACT = {
+    "displacement_axis": 0.0,
+    "voltage_at_film": 0.0,
+    "thickness_uncertainty": 0.0,
+    "prestretch_uncertainty": 0.0,
+    "disk_radius_uncertainty": 0.0,
+    "ring_radius_uncertainty": 0.0,
+}
 ERRORS = {
     "force_gain": 1e-3,
     "force_zero": 2e-4,
@@ -80,6 +88,7 @@ def make_experiment(
     noise: float = FORCE_NOISE,
     errors: dict[str, float] | None = None,
     gains: bool = False,
+    exact: bool = True,
 ) -> list[Curve]:
     """The paper's experiment: up and down at every voltage with every disk.
 
@@ -88,6 +97,7 @@ def make_experiment(
     """
     random = np.random.default_rng(seed)
     stated = ERRORS if errors is None else errors
+    dimensions = EXACT if exact else {}
     draw = {name: size * random.standard_normal() for name, size in stated.items()}
     curves = []
     way = np.arange(samples) * (2 * highest / SPEED / samples)
@@ -117,7 +127,7 @@ def make_experiment(
                     time=way + number * (2 * highest / SPEED + 5.0),
                     force_noise=noise,
                     displacement_noise=5e-6 if stated else 0.0,
-                    **stated,
+                    **(dimensions | stated),
                 )
             )
     return curves

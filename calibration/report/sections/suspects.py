@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,14 +30,18 @@ def _row(fit: Identification, suspect: Suspect) -> list[Any]:
     from markupsafe import Markup
 
     factor, unit = SHOWN[suspect.unit]
-    amplitude, uncertainty = rounded(suspect.amplitude * factor, suspect.uncertainty * factor)
-    row: list[Any] = [suspect.name, f"{amplitude} ± {uncertainty} {unit}"]
-    row.append(f"{two_digits(suspect.shows_from * factor)} {unit}")
+    row: list[Any] = [suspect.name]
+    if math.isfinite(suspect.uncertainty):
+        amplitude, uncertainty = rounded(suspect.amplitude * factor, suspect.uncertainty * factor)
+        row += [f"{amplitude} ± {uncertainty} {unit}", f"{two_digits(suspect.shows_from * factor)} {unit}"]
+    else:
+        row += ["cannot be seen", f"never; at {two_digits(suspect.unseen_size * factor)} {unit}:"]
     for name, shift in fit.unseen[suspect.name].items():
         quantity = fit.quantities[name]
         text = f"{100.0 * shift / quantity.value:+.2g} %"
         row.append(Markup("<b>{}</b>").format(text) if abs(shift) > quantity.uncertainty else text)
-    return [*row, suspect.remedy.replace("`", "")]
+    counted = f" (in the budget: {suspect.part})" if suspect.part else ""
+    return [*row, suspect.remedy.replace("`", "") + counted]
 
 
 TEMPLATE = """

@@ -25,6 +25,10 @@ PARKER = NAMED["parker-cao2018"]
 ONE_TERM = Material(name="one term", mu=(37_834.0,), alpha=(5.4985,), eps_r=1.7)  # the one-term film nearest to it
 
 
+EXACT = {f"{name}_uncertainty": 0.0 for name in ("thickness", "prestretch", "disk_radius", "ring_radius")}
+EXACT |= {"displacement_axis": 0.0, "voltage_at_film": 0.0}
+
+
 def deviation(found: Identification, name: str, truth: float) -> float:
     """Distance from the truth in stated standard uncertainties."""
     quantity = found.quantities[name]
@@ -49,8 +53,9 @@ def test_permittivity_and_stiffness_are_recovered_within_their_stated_uncertaint
     assert deviation(paper, "stiffness", secant_modulus(PARKER, *paper.stretch)) < 3.0
     assert paper.quantities["eps_r"].relative < 0.015
     assert paper.quantities["stiffness"].relative < 0.015
-    assert paper.quantities["eps_r"].verdict == "identified"
-    assert paper.quantities["stiffness"].verdict == "identified"
+    # With every dimension exact to the last digit, imperfections that would not show could do more harm than is stated.
+    assert paper.quantities["eps_r"].verdict == "weakly identified"
+    assert "could shift it unseen" in paper.quantities["eps_r"].doubt
 
 
 def test_the_two_term_set_is_called_not_identifiable(paper: Identification) -> None:
@@ -117,6 +122,7 @@ def design(material: Material, highest: float, voltages: tuple[float, ...], poin
             nominal_voltage=voltage,
             direction=np.ones(points, dtype=int),
             force_noise=0.01 * largest,
+            **EXACT,
         )
         for specimen in specimens
         for voltage in voltages
@@ -155,7 +161,7 @@ def test_fisher_information_of_the_papers_protocols(
 def test_systematic_errors_propagate_as_the_scaling_laws_of_the_film_demand(
     field: str, entry: str, stiffness: float, permittivity: float
 ) -> None:
-    curves = [replace(curve, **{field: 1e-3}) for curve in design(PARKER, 12e-3, (0.0, 1500.0), 50)]
+    curves = [replace(curve, batch="one sheet", **{field: 1e-3}) for curve in design(PARKER, 12e-3, (0.0, 1500.0), 50)]
     stated = expected_uncertainties(curves, PARKER)
     for name, factor in (("stiffness", stiffness), ("G", stiffness), ("eps_r", permittivity)):
         share = stated[name].budget[entry] / abs(stated[name].value)
