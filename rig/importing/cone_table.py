@@ -32,7 +32,7 @@ SWEEPS_DIFFER = 0.05  # of the largest force: sweeps at one voltage that differ 
 REST = 5.0  # times its noise: the disk is at rest
 MOST_SWEEPS = 200
 # What is not stated (standard uncertainties). Cells and amplifiers of class 0.5; lasers, and monitors of supplies.
-FORCE_GAIN, DISPLACEMENT_GAIN, VOLTAGE_GAIN = 0.005, 0.005, 0.01
+FORCE_GAIN = 0.005  # gains of displacement and voltage are assumed by the curve
 FORCE_ZERO, DISPLACEMENT_ZERO = 0.01, 2e-5  # of the largest force; m: where the disk touches the film
 
 
@@ -534,8 +534,6 @@ def _curve(name: str, number: int, sweep: Sweep, part: Part, specimen: Specimen)
         force_noise=max(noise_of(force), 0.3 * resolution, 1e-9 * float(np.abs(force).max())),
         displacement_noise=max(noise_of(h), 0.3 * _resolution(h)),
         force_gain=FORCE_GAIN,
-        displacement_gain=DISPLACEMENT_GAIN,
-        voltage_gain=VOLTAGE_GAIN,
         force_zero=FORCE_ZERO * float(np.abs(force).max()),
         displacement_zero=DISPLACEMENT_ZERO,
         time=values["time"][rows] if "time" in values else None,

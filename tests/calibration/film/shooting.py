@@ -7,8 +7,8 @@ It shares nothing with `model`. With ``x = ln R``, ``l1``, ``l2`` the total stre
     dl1/dx = (S2 cos(theta) - S1 - W12 dl2/dx) / W11
     dz/dx  = R l1 sin(theta) / lp
 
-with ``S1``, ``S2`` the derivatives of the energy density by the stretches, electric part included. Unknown are l1 at the
-disk and F; at the ring ``l2 = lp`` and ``z = h`` (Newton, all states at once; Runge-Kutta of order 4).
+with ``S1``, ``S2`` the derivatives of the energy density by the stretches, electric part included. Unknown are l1 at
+the disk and F; at the ring ``l2 = lp`` and ``z = h`` (Newton, all states at once; Runge-Kutta of order 4).
 """
 
 from __future__ import annotations
