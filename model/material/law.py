@@ -275,6 +275,30 @@ class Stress:
     maxwell: Array | None
     relief: Relief | None = None
 
+    def where(self, new: NDArray[np.bool_], other: Stress) -> Stress:
+        """These stresses, and those of ``other`` for the states that are ``new`` (S,)."""
+
+        def pick(one: Array, two: Array) -> Array:
+            return np.where(new, two, one)
+
+        relief = self.relief
+        if relief is not None and other.relief is not None:
+            relief = Relief(
+                pick(relief.change, other.relief.change),
+                pick(relief.rate, other.relief.rate),
+                np.where(new, other.relief.regular, relief.regular),
+            )
+        maxwell = None if self.maxwell is None or other.maxwell is None else pick(self.maxwell, other.maxwell)
+        return Stress(
+            pick(self.t1, other.t1),
+            pick(self.t2, other.t2),
+            pick(self.h11, other.h11),
+            pick(self.h12, other.h12),
+            pick(self.h22, other.h22),
+            maxwell,
+            relief,
+        )
+
 
 @dataclass(slots=True)
 class Relief:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Array
-from model.membrane import refinement, ritz, tension_field
+from model.membrane import convexity, refinement, ritz, tension_field
 from model.membrane.refinement import Iterate
 from model.membrane.ritz import Grid, Problem, State
 
@@ -26,11 +26,12 @@ class Trace:
     grid: Grid
     state: State
     reached: NDArray[np.bool_]
+    progress: Array  # where they ended: 0 to 1 raises the disk, 1 to 2 the voltage
     limit: NDArray[np.bool_]  # a limit point is where the path ends, or close
     steps: NDArray[np.intp]
 
 
-def _at(problem: Problem, index: NDArray[np.intp], progress: Array) -> Problem:
+def at(problem: Problem, index: NDArray[np.intp], progress: Array) -> Problem:
     """The problem at a place of the path: 0 to 1 raises the disk, 1 to 2 the voltage."""
     part = problem.take(index)
     rise = np.minimum(progress, 1.0)
@@ -71,29 +72,30 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
 
     # Most states are found at once at their height without voltage; the others begin low.
     progress = np.ones(states)
-    begin = _at(problem, everyone, progress)
+    begin = at(problem, everyone, progress)
     found = correct(begin, grid, first(begin, grid), 1e-3, 15)
     steps = found.steps
     current, alive = found.state, found.ok
     if not alive.all():
         late = np.flatnonzero(~alive)
         progress[late] = 0.0
-        begin = _at(problem, late, progress[late])
+        begin = at(problem, late, progress[late])
         found = correct(begin, grid.take(late), first(begin, grid.take(late)), 1e-3, 25)
         steps[late] += found.steps
         current.put(late, found.state)
         alive[late] = found.ok
     end = 1.0 if problem.film.field is None else 2.0
-    begun = lowest(_at(problem, everyone, progress), grid, current)
+    begun = lowest(at(problem, everyone, progress), grid, current)
     before, before_progress = State(current.c.copy(), current.w.copy()), progress.copy()
     size = np.full(states, 0.5)
+    concave = np.zeros(states, dtype=np.bool_)
     while True:
         active = np.flatnonzero(alive & (progress < end))
         if len(active) == 0:
             break
         leg_end = np.where(progress[active] < 1.0, 1.0, 2.0)
         aim = np.minimum(progress[active] + size[active], leg_end)
-        part, laid = _at(problem, active, aim), grid.take(active)
+        part, laid = at(problem, active, aim), grid.take(active)
         here = current.take(active)
         run = progress[active] - before_progress[active]
         ratio = np.where(run > 0.0, (aim - progress[active]) / np.where(run > 0.0, run, 1.0), 0.0)
@@ -105,6 +107,15 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
         steps[active] += found.steps
         jump = np.abs(found.state.w / w - 1.0).max(axis=(0, 1))
         good = found.ok & (jump < CORRECTION)
+        least = np.full(len(active), np.inf)
+        some = np.flatnonzero(good & (aim > 1.0))
+        if len(some):
+            new = convexity.stations(part.take(some), laid.take(some), found.state.take(some), found.lam[some])
+            old = convexity.stations(part.take(some), laid.take(some), here.take(some), found.lam[some])
+            charged = part.take(some)
+            # A step that carries points over a range that is not convex is not a step along a branch.
+            least[some] = np.minimum(convexity.margin(charged, new), convexity.margin(charged, old.toward(new, 0.5)))
+            good &= least > 0.0
         moved, held = active[good], active[~good]
         before.c[:, moved], before.w[..., moved] = current.c[:, moved], current.w[..., moved]
         before_progress[moved] = progress[moved]
@@ -114,13 +125,16 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
         size[held] *= 0.35
         crossed = moved[(before_progress[moved] < 1.0) & (progress[moved] >= 1.0)]
         before_progress[crossed] = progress[crossed]  # another direction: the last step predicts nothing
+        # Where the law loses convexity in a step that may not be shorter, the branch has ended there.
+        concave[active[least <= 0.0]] = True
+        concave[moved] = False
         alive[size < LEAST_STEP] = False
     reached = alive & (progress >= end)
-    limit = np.zeros(states, dtype=np.bool_)
+    limit = concave
     some = np.flatnonzero(np.isfinite(begun) & (begun > 0.0))
     if len(some):
-        end_of = _at(problem, some, progress[some]), grid.take(some), current.take(some)
-        limit[some] = lowest(*end_of) < SOFT * begun[some]
+        end_of = at(problem, some, progress[some]), grid.take(some), current.take(some)
+        limit[some] |= lowest(*end_of) < SOFT * begun[some]
         if relaxed:
             limit[some] |= _no_width(*end_of)
-    return Trace(grid, current, reached, limit, steps)
+    return Trace(grid, current, reached, progress, limit, steps)

@@ -25,7 +25,7 @@ class Extremes:
     hoop: Array
     meridional: Array
     log_stretch: Array
-    softening: Array  # largest share of the meridional stiffness that the voltage takes away
+    softening: Array  # largest share of the stiffness that the voltage takes away, see `softened`
 
     def take(self, index: Index) -> Extremes:
         return Extremes(*(getattr(self, f.name)[index] for f in fields(self)))
@@ -75,6 +75,9 @@ def edges(problem: Problem, grid: Grid, state: State, at: Points, lam: Array) ->
         wrinkled = np.stack((state.relaxed[0, 0], state.relaxed[-1, -1]))
         natural = np.stack((t.ends[0] @ at.log[1][:, 0], t.ends[1] @ at.log[1][:, -1]))
         log2 = np.where(wrinkled, natural, log2)
+        # A wrinkled element is a straight cone: its slope tells the pull at its end.
+        sin = np.stack((state.w[0, 0], state.w[-1, -1])) / np.sqrt(np.stack((at.metric[0, 0], at.metric[-1, -1])))
+        pull = np.where(wrinkled, lam / sin, pull) * np.where(wrinkled, [1.0 / inner, np.ones_like(inner)], 1.0)
     start1, start2 = log1, log2
     for n in range(4):
         now = stress(problem.film, stack(log1, log2))
@@ -170,6 +173,7 @@ def extremes(problem: Problem, grid: Grid, state: State, at: Points, lam: Array)
         softening = np.zeros(len(lam))
     else:
         softening = (2.0 * law.maxwell / (law.h11 + 2.0 * law.maxwell)).max(axis=(0, 1))
+        softening = np.maximum(softening, _softened(problem, log, edge))
     return Extremes(
         log_area=best[0],
         radius=radius[0],
@@ -178,6 +182,35 @@ def extremes(problem: Problem, grid: Grid, state: State, at: Points, lam: Array)
         log_stretch=np.maximum(best[3], best[4]),
         softening=softening,
     )
+
+
+# Shares of the way from the pre-stretched film to the widest point at which the law is looked at; and what a share of
+# the hoop's stiffness counts beside one of the meridian's: a circle is held by its neighbours.
+WAY = (0.25, 0.5, 0.75, 1.0)
+HOOP = 0.7
+
+
+def _softened(problem: Problem, log: Array, edge: Edges) -> Array:
+    """Largest share of a stiffness that the voltage takes on the way from the pre-stretched film to its widest point.
+
+    In either direction, the natural width of a wrinkled point included. A point far out, where the law is stiff again,
+    has its way through all that is soft; an answer like that may lie beyond the end of the branch from rest.
+    """
+    states = log.shape[-1]
+    log1 = np.concatenate((log[0].reshape(-1, states), edge.log1))
+    log2 = np.concatenate((log[1].reshape(-1, states), edge.log2))
+    widest, columns = (log1 + log2).argmax(axis=0), np.arange(states)
+    start = problem.log_prestretch
+    share = np.array(WAY)[:, None]
+    way = [start + share * (x[widest, columns] - start) for x in (log1, log2)]
+    law = stress(problem.film, stack(way[0], way[1]))
+    assert law.maxwell is not None
+    twice = 2.0 * law.maxwell
+    both = np.maximum(twice / (law.h11 + twice), HOOP * twice / (law.h22 + twice))
+    # Where the elastic law itself gives way there is nothing left to share.
+    both = np.where((law.h11 + twice > 0.0) & (law.h22 + twice > 0.0), both, 1.0)
+    softened: Array = both.max(axis=0)
+    return softened
 
 
 @dataclass(slots=True)

@@ -472,7 +472,7 @@ class Solver:
             lnlp = self.film.log_prestretch
             excess = [x + lnlp - natural for x, natural in zip(hoop, fold.natural, strict=True)]
             margins.append((1.0, (fine @ excess).tolist()))
-        bound = tension_field.SLACK * refinement.goal(tolerance) * max(abs(x) for _, values in margins for x in values)
+        bound = tension_field.wrong_sign(tolerance) * max(abs(x) for _, values in margins for x in values)
         short = min(right - left for left, right in pairwise(self.breaks)) <= 1e-9 * self.film.span
         return not short and all(sign * x < bound for sign, values in margins for x in values)
 

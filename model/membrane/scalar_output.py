@@ -7,7 +7,7 @@ import math
 from math import exp, log1p
 from typing import TYPE_CHECKING
 
-from model.membrane.output import FINE, POLISH, series
+from model.membrane.output import FINE, HOOP, POLISH, WAY, series
 from model.membrane.scalar_state import Cone, Film, Floats, Found, NotOrdinary, Panel, Tables, stress
 
 if TYPE_CHECKING:
@@ -40,6 +40,8 @@ def found(solver: Solver, lam: float, error: float, steps: int) -> Found:
         if kind == 0:
             where = exp(place)
         best.append(top)
+    if solver.film.field != 0.0:
+        softening = max(softening, _softened(solver, edges, inside))
     return Found(
         solver.modes,
         solver.breaks,
@@ -56,6 +58,27 @@ def found(solver: Solver, lam: float, error: float, steps: int) -> Found:
         log_stretch=max(best[3:]),
         softening=softening,
     )
+
+
+def _softened(solver: Solver, edges: list[Values], inside: list[tuple[Floats, ...]]) -> float:
+    """As `model.membrane.output` has it: on the way to the widest point."""
+    film = solver.film
+    area, log1, log2 = max((edge[0], edge[3], edge[4]) for edge in edges)
+    for areas, _, _, logs1, logs2 in inside:
+        widest = max(areas)
+        if widest > area:
+            at = areas.index(widest)
+            area, log1, log2 = widest, logs1[at], logs2[at]
+    start, softened = film.log_prestretch, 0.0
+    solver.count.mechanical += len(WAY)
+    solver.count.electric += len(WAY)
+    for share in WAY:
+        _, _, h11, _, h22, b = stress(film, start + share * (log1 - start), start + share * (log2 - start))
+        twice = 2.0 * b
+        if not (h11 + twice > 0.0 and h22 + twice > 0.0):
+            return 1.0
+        softened = max(softened, twice / (h11 + twice), HOOP * twice / (h22 + twice))
+    return softened
 
 
 def _taut(solver: Solver, panel: Panel, lam: float) -> tuple[tuple[Floats, ...], list[Values], float]:

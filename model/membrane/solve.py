@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import Array
 from model.material.law import Evaluations, Film, stack, stress
 from model.material.materials import EPSILON_0
-from model.membrane import continuation, ritz, scalar, tension_field
+from model.membrane import from_rest, ritz, scalar, tension_field
 from model.membrane.profile import Profile, dense, profile
 from model.membrane.refinement import ROUND_OFF_TENSION, Answer, Start, first_modes, refine
 from model.membrane.ritz import LONGEST, Grid, Problem, State
@@ -28,7 +28,6 @@ BLOCK = 1024  # states solved together: their arrays stay in the processor's cac
 # Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
 # followed from rest.
 SOFTENING = 0.35
-FOLLOW_MODES = 10
 WIDEST = 28.0  # ln(b/a) beyond which the film's R^2 has no place in double precision
 
 
@@ -573,24 +572,11 @@ class _Block:
         sensitivities: bool,
     ) -> None:
         """Solve states for which a cold start may have missed, or jumped from, the branch that starts at rest."""
-        part = problem.take(some)
-        path = continuation.follow(part, FOLLOW_MODES, relaxed=relaxed)
-        steps[some] += path.steps
-        status = np.where(path.limit, Status.UNSTABLE, Status.NOT_CONVERGED)
-        result.status[self.index[index[some]]] = status
-        good = np.flatnonzero(path.reached)
-        if len(good) == 0:
-            return
-        here, grid, state = part.take(good), path.grid.take(good), path.state.take(good)
-        if relaxed:
-            answers, _, spent = tension_field.solve(
-                here, tolerance, sensitivities=sensitivities, begin=Start(grid, state)
-            )
-        else:
-            answers, _, spent = refine(here, tolerance, Start(grid, state), sensitivities=sensitivities)
-        steps[some[good]] += spent
+        answers, ended = from_rest.solve(problem.take(some), tolerance, relaxed=relaxed, sensitivities=sensitivities)
+        steps[some] += ended.steps
+        result.status[self.index[index[some]]] = np.where(ended.unstable, Status.UNSTABLE, Status.NOT_CONVERGED)
         for answer in answers:
-            answer.index = some[good[answer.index]]
+            answer.index = some[answer.index]
             self.place(result, index, answer, np.ones(len(answer.index), dtype=np.bool_))
 
     def slack(self) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -23,12 +24,15 @@ from model.membrane import refinement, ritz
 from model.membrane.output import FINE, fine_table
 from model.membrane.refinement import Answer, Iterate, Start
 from model.membrane.ritz import Grid, Points, Problem, State
+from model.membrane.soft_cone import SoftCones
 from model.membrane.wrinkled_cone import Cones, Springs, natural_width, whole
 
 START_MODES = 5
 MOST_ZONES = 5
 ROUNDS = 4
 SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a wrong sign, as it has beside a cut
+STEPS, CAREFUL_STEPS = 15, 40  # most of a rung
+CALM = 1e-4  # change of the strains from which a careful solution moves its cuts
 CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
 
 
@@ -81,6 +85,11 @@ def search(problem: Problem, grid: Grid, state: State, goal: float = 2e-2, limit
             return Iterate(grid, state, lam, change, np.zeros(states), stable, quiet & stable & (lam > 0.0), steps)
     stable = step.stable & at.law.relief.regular.all(axis=(0, 1))
     return Iterate(grid, state, step.lam, change, np.zeros(states), stable, quiet & stable & (step.lam > 0.0), steps)
+
+
+def wrong_sign(tolerance: float) -> float:
+    """Share of the largest tension that may have a wrong sign: its zone would change the force by the third power."""
+    return SLACK * refinement.goal(max(tolerance, 1e-8))
 
 
 @dataclass(slots=True)
@@ -160,21 +169,36 @@ def remap(old: Grid, state: State, natural: Array, breaks: Array, modes: int, wr
     return Start(grid, State(c, w, to_points(natural), np.broadcast_to(wrinkled[:, None], w.shape)))
 
 
-def settle(problem: Problem, grid: Grid, state: State, goal: float, limit: int = 15) -> Iterate:
-    """Newton on the state together with the cuts, every wrinkled element a cone."""
+def settle(
+    problem: Problem, grid: Grid, state: State, goal: float, kind: type[Cones] = Cones, *, careful: bool = False
+) -> Iterate:
+    """Newton on the state together with the cuts, every wrinkled element a cone of this ``kind``.
+
+    ``careful`` moves the cuts only once the strains have nearly settled: a taut zone that is about to vanish hangs on
+    a hoop tension that is a small rest, and steps of both together overshoot.
+    """
     assert state.relaxed is not None
-    kinds = state.relaxed[0, :, 0].tolist()
-    folded = tuple(k for k, kind in enumerate(kinds) if kind)
-    taut = tuple(k for k, kind in enumerate(kinds) if not kind)
+    zones = state.relaxed[0, :, 0].tolist()
+    folded = tuple(k for k, wrinkled in enumerate(zones) if wrinkled)
+    taut = tuple(k for k, wrinkled in enumerate(zones) if not wrinkled)
     modes, m = grid.table.modes, grid.elements
     own = np.concatenate([np.arange(k * modes, (k + 1) * modes) for k in taut] + [np.arange(m * modes, grid.unknowns)])
     film = State(state.c[own.astype(np.intp)], state.w[:, list(taut)])
-    cones = Cones.of(problem, grid, state, folded)
-    return _settle(problem, grid, film, taut, cones, goal, limit)
+    cones = kind.of(problem, grid, state, folded)
+    if careful:
+        return _settle(problem, grid, film, taut, cones, min(goal, CALM), CAREFUL_STEPS, careful)
+    return _settle(problem, grid, film, taut, cones, goal, STEPS, careful)
 
 
 def _settle(
-    problem: Problem, grid: Grid, film: State, taut: tuple[int, ...], cones: Cones, goal: float, limit: int
+    problem: Problem,
+    grid: Grid,
+    film: State,
+    taut: tuple[int, ...],
+    cones: Cones,
+    goal: float,
+    limit: int,
+    careful: bool,
 ) -> Iterate:
     states = film.w.shape[2]
     steps = np.zeros(states, dtype=np.intp)
@@ -194,6 +218,8 @@ def _settle(
         change = np.maximum(np.maximum(change, bent), np.abs(dq).max(axis=(0, 1), initial=0.0) / size)
         tension = at.law.t2 + at.law.h12 * (at.along * dq + at.down * step.dw) + at.law.h22 * at.around * de
         breaks, shift = _moved(grid, panels, taut, cones.which, tension)
+        if careful:
+            breaks = np.where(change <= CALM, breaks, grid.breaks)
         change = np.maximum(change, CUT_WEIGHT * shift)
         # Where it has settled the state belongs to the cuts as they were.
         grid = Grid.lay(grid.table.modes, np.where(change <= goal, grid.breaks, breaks))
@@ -204,11 +230,11 @@ def _settle(
         if len(rest) == 0 or int(steps[0]) >= limit or len(rest) <= 0.5 * states:
             break
     ends = refinement.tail(problem, panels, film, step)
-    state = whole(grid, film, taut, cones)
+    state = whole(grid, film, taut, cones.unrolled(problem, grid))
     result = Iterate(grid, state, step.lam, change, ends, stable, done & stable & (step.lam > 0.0), steps)
     if len(rest) > 0 and int(steps[0]) < limit:
         some = (problem.take(rest), grid.take(rest), film.take(rest), taut, cones.take(rest))
-        result.put(rest, _settle(*some, goal, limit - int(steps[0])))
+        result.put(rest, _settle(*some, goal, limit - int(steps[0]), careful))
     return result
 
 
@@ -256,12 +282,12 @@ def admissible(grid: Grid, state: State) -> NDArray[np.bool_]:
 
 
 def solve(
-    problem: Problem, tolerance: float, *, sensitivities: bool, begin: Start | None = None
+    problem: Problem, tolerance: float, *, sensitivities: bool, begin: Start | None = None, careful: bool = False
 ) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
     """Solve states of which some part is wrinkled. Returns what `refinement.refine` does.
 
     ``begin`` is a state of the plain equations, or one with every point taut or wrinkled by itself; found by `search`
-    when not given.
+    when not given. ``careful`` is for states near loss of convexity or of a zone: `SoftCones`, and patient cuts.
     """
     index = np.arange(len(problem.span))
     steps = np.zeros(len(index), dtype=np.intp)
@@ -280,7 +306,7 @@ def solve(
         queue, pending = pending, []
         for some, begun in queue:
             if len(some):
-                _round(problem, tolerance, sensitivities, some, begun, steps, answers, lost, pending)
+                _round(problem, tolerance, sensitivities, careful, some, begun, steps, answers, lost, pending)
     lost.extend(some for some, _ in pending)
     return answers, np.concatenate(lost), steps
 
@@ -289,6 +315,7 @@ def _round(
     problem: Problem,
     tolerance: float,
     sensitivities: bool,
+    careful: bool,
     index: NDArray[np.intp],
     start: Start,
     steps: NDArray[np.intp],
@@ -298,17 +325,18 @@ def _round(
 ) -> None:
     """Cut the elements where the zones of ``start`` end, and solve; other zones than before: once more (``again``)."""
     here = problem.take(index)
+    settler = partial(settle, kind=SoftCones, careful=True) if careful else settle
     state = start.state
     mixed: NDArray[np.bool_] = np.zeros(len(index), dtype=np.bool_)
     if state.relaxed is not None:
         mixed = np.asarray((state.relaxed.any(axis=0) & ~state.relaxed.all(axis=0)).any(axis=0))
-    for kind in (False, True):
-        some = np.flatnonzero(mixed == kind)
+    for single in (False, True):
+        some = np.flatnonzero(mixed == single)
         if len(some) == 0:
             continue
         part, grid, chosen = here.take(some), start.grid.take(some), state.take(some)
         at = ritz.evaluate(part, grid, chosen)
-        zone = zones(grid, chosen, at)
+        zone = zones(grid, chosen, at, slack=wrong_sign(tolerance))
         pattern = 2 * zone.changes + zone.first
         for number in np.unique(pattern).tolist():
             changes, first = number // 2, bool(number % 2)
@@ -320,7 +348,7 @@ def _round(
             breaks, wrinkled = _cut(film, zone.where[:changes, of], first)
             modes = max(3, refinement.first_modes(float((breaks[1:] - breaks[:-1]).max()), tolerance))
             begun = remap(grid.take(of), chosen.take(of), at.log[1][..., of], breaks, modes, wrinkled)
-            done, missed, spent = refinement.refine(film, tolerance, begun, sensitivities=sensitivities, settle=settle)
+            done, missed, spent = refinement.refine(film, tolerance, begun, sensitivities=sensitivities, settle=settler)
             where = index[some[of]]
             lost.append(where[missed])
             steps[where] += spent
@@ -330,7 +358,7 @@ def _round(
                     answer.grid,
                     answer.state,
                     ritz.evaluate(solved, answer.grid, answer.state),
-                    slack=SLACK * refinement.goal(tolerance),
+                    slack=wrong_sign(tolerance),
                 )
                 same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
                 answer.index = where[answer.index]

@@ -27,17 +27,41 @@ NEAR = 1e-2  # of ln(l2): from here Newton on the whole film takes the natural w
 CURVED = 2.0  # Newton's error is this squared times what like changes of a taut element leave
 
 
-def natural_width(problem: Problem, log1: Array, start: Array, within: float) -> tuple[Array, Stress]:
-    """``ln l2`` that makes no hoop stress at ``log1``, after a step smaller than ``within``; and the law before it."""
-    everywhere = np.ones(log1.shape, dtype=np.bool_)
-    log2 = start
+def natural_width(
+    problem: Problem, log1: Array, start: Array, within: float, where: NDArray[np.bool_] | None = None
+) -> tuple[Array, Stress]:
+    """``ln l2`` that makes no hoop stress at ``log1``, after a step smaller than ``within``; and the law before it.
+
+    Each state steps for itself, so that none depends on the others; elsewhere than ``where`` nothing is sought.
+    """
+    everywhere = np.ones(log1.shape, dtype=np.bool_) if where is None else where
+    log2, axes = start, tuple(range(log1.ndim - 1))
+    moving = np.ones(log1.shape[-1], dtype=np.bool_)
+    kept: Stress | None = None
     for _ in range(8):
         law = relax(problem.film, stress(problem.film, stack(log1, log2)), everywhere)
         assert law.relief is not None
-        log2 = log2 + np.clip(law.relief.change, -0.3, 0.3)
-        if not np.abs(law.relief.change).max(initial=0.0) > within:
+        kept = law if kept is None else kept.where(moving, law)
+        log2 = np.where(moving, log2 + np.clip(law.relief.change, -0.3, 0.3), log2)
+        moving &= np.abs(law.relief.change).max(axis=axes, initial=0.0) > within
+        if not moving.any():
             break
-    return log2, law
+    assert kept is not None
+    return log2, kept
+
+
+def folded(problem: Problem, u: Array, natural: Array) -> Stress:
+    """The relaxed law at ``u = ln(l1/lp)``, linearised at ``natural``."""
+    log1 = u + problem.log_prestretch
+    return relax(problem.film, stress(problem.film, stack(log1, natural)), np.ones(log1.shape, dtype=np.bool_))
+
+
+def maxwell_share(law: Stress) -> Array:
+    """Largest Maxwell stress over meridional stress, (S,), at least one."""
+    if law.maxwell is None:
+        return np.ones(law.t1.shape[-1])
+    share: Array = np.abs(law.maxwell / law.t1).max(axis=(0, 1), initial=1.0)
+    return share
 
 
 @dataclass(slots=True)
@@ -65,10 +89,38 @@ class Cones:
         natural, _ = natural_width(problem, u + problem.log_prestretch, state.natural[:, index], NEAR)
         return cls(which, u, natural, across / long, down / long)
 
+    def pulled(self, problem: Problem, grid: Grid) -> Pulled:
+        """Linearise the law along the cones."""
+        index = list(self.which)
+        radius, once = grid.radius[:, index], grid.once[:, index]
+        law = folded(problem, self.u, self.natural)
+        assert law.relief is not None
+        stretch = np.exp(self.u)
+        s1 = law.t1 / stretch
+        rate = stretch / (law.h11 - law.t1)
+        pull = self.pull if self.pull is not None else (once * radius * s1).sum(axis=0) / once.sum(axis=0)
+        rest = pull / radius - s1
+        return Pulled(
+            pull,
+            excess=(once * (np.expm1(self.u) + stretch * rate * rest)).sum(axis=0),
+            axial=(once / radius * stretch * rate).sum(axis=0),
+            rate=rate,
+            rest=rest,
+            radius=radius,
+            change=law.relief.change,
+            follow=law.relief.rate,
+            share=maxwell_share(law),
+            regular=np.asarray(law.relief.regular.all(axis=(0, 1)) & (rate > 0.0).all(axis=(0, 1))),
+        )
+
+    def unrolled(self, problem: Problem, grid: Grid) -> Cones:
+        """The cones with their stretches at the points in R."""
+        return self
+
     def take(self, index: Index) -> Cones:
         """The states at ``index``."""
         pull = None if self.pull is None else self.pull[:, index]
-        return Cones(
+        return type(self)(
             self.which, self.u[..., index], self.natural[..., index], self.cos[:, index], self.sin[:, index], pull
         )
 
@@ -85,11 +137,28 @@ class Cones:
 
 
 @dataclass(slots=True)
+class Pulled:
+    """How cones answer a change of their pull, at stations (P, K, S): points, or the two ends of `SoftCones`."""
+
+    pull: Array  # (K, S)
+    excess: Array  # (K, S): X at that pull
+    axial: Array  # (K, S): B = dX/dC
+    rate: Array  # du = rate (C/R - S1)
+    rest: Array  # C/R - S1
+    radius: Array
+    change: Array  # of the natural width, apart from following u, wherever there is one
+    follow: Array
+    share: Array  # (S,): largest Maxwell stress over stress
+    regular: NDArray[np.bool_]  # (S,): a natural width, and a stress that rises with the stretch
+    spread: Array | None = None  # share of the inner end's change of u that the other points take
+
+
+@dataclass(slots=True)
 class Springs:
     """Cones linearised: what they add to the film's Newton system, and how they follow its step."""
 
     cones: Cones
-    pull: Array
+    law: Pulled
     cut: NDArray[np.intp]  # (K, 2): unknowns of the strains at both ends, -1 where clamped
     ends: Array  # (K, 2, S): -R and R there
     miss: Array  # (K, S): what the ends stand apart beyond what the pull explains
@@ -97,33 +166,16 @@ class Springs:
     skew: Array  # d(distance)/dlam = d(height)/dH
     give: Array  # d(height)/dlam at fixed distance
     height: Array
-    rate: Array  # (Q, K, S): du = (C/R - S1)/(dS1/du)
-    rest: Array
-    radius: Array
-    change: Array  # of the natural width, apart from following u
-    follow: Array
-    share: Array  # (S,): largest Maxwell stress over stress
     regular: NDArray[np.bool_]  # (S,): a natural width and a stable spring
 
     @classmethod
     def of(cls, problem: Problem, grid: Grid, panels: Grid, cones: Cones, c: Array) -> Springs:
         """Linearise ``cones`` of ``grid``; ``c`` are the unknowns of ``panels``, its other elements."""
         index = list(cones.which)
-        radius, once = grid.radius[:, index], grid.once[:, index]
-        log1 = cones.u + problem.log_prestretch
-        law = stress(problem.film, stack(log1, cones.natural))
-        share = np.ones(c.shape[1]) if law.maxwell is None else np.abs(law.maxwell / law.t1).max((0, 1), initial=1.0)
-        law = relax(problem.film, law, np.ones(log1.shape, dtype=np.bool_))
-        assert law.relief is not None
-        stretch = np.exp(cones.u)
-        s1 = law.t1 / stretch
-        rate = stretch / (law.h11 - law.t1)
-        pull = cones.pull if cones.pull is not None else (once * radius * s1).sum(axis=0) / once.sum(axis=0)
-        rest = pull / radius - s1
+        law = cones.pulled(problem, grid)
+        pull, excess, axial = law.pull, law.excess, law.axial
         cos, sin = cones.cos, cones.sin
         first, last = np.exp(grid.breaks[index]), np.exp(grid.breaks[[k + 1 for k in index]])
-        excess = (once * (np.expm1(cones.u) + stretch * rate * rest)).sum(axis=0)
-        axial = (once / radius * stretch * rate).sum(axis=0)
         across = (last - first + excess) / pull
         soft = axial * cos * cos + across * sin * sin
         skew = (axial - across) * cos * sin
@@ -131,29 +183,13 @@ class Springs:
         ends = np.stack((-first, last), axis=1)
         strain = np.concatenate((c, np.zeros((1, c.shape[1]))))[cut]
         miss = (ends * strain).sum(axis=1) - (excess * cos - (last - first) * sin * sin / (1.0 + cos))
-        regular = law.relief.regular.all(axis=(0, 1)) & (rate > 0.0).all(axis=(0, 1)) & (soft > 0.0).all(axis=0)
-        return cls(
-            cones,
-            pull,
-            cut,
-            ends,
-            miss,
-            soft,
-            skew,
-            axial * across / soft,
-            across * pull * sin,
-            rate,
-            rest,
-            radius,
-            law.relief.change,
-            law.relief.rate,
-            share,
-            regular,
-        )
+        regular = law.regular & (soft > 0.0).all(axis=0)
+        height = across * pull * sin
+        return cls(cones, law, cut, ends, miss, soft, skew, axial * across / soft, height, regular)
 
     def join(self, system: Reduced) -> None:
         """Add the springs to the system of the other elements."""
-        h, lam = self.pull * self.cones.cos, self.pull * self.cones.sin
+        h, lam = self.law.pull * self.cones.cos, self.law.pull * self.cones.sin
         ratio = self.skew / self.soft
         force = h + self.miss / self.soft + ratio * lam
         for k, cut in enumerate(self.cut.tolist()):
@@ -170,20 +206,21 @@ class Springs:
 
     def advance(self, dc: Array, lam: Array) -> tuple[Cones, Array]:
         """The cones after the step ``dc``, with the force ``lam``; and the largest relative change."""
-        cones = self.cones
+        cones, law = self.cones, self.law
         moved = (self.ends * np.concatenate((dc, np.zeros((1, dc.shape[1]))))[self.cut]).sum(axis=1)
-        h = self.pull * cones.cos + (self.miss + moved - self.skew * (lam - self.pull * cones.sin)) / self.soft
+        h = law.pull * cones.cos + (self.miss + moved - self.skew * (lam - law.pull * cones.sin)) / self.soft
         pull = np.hypot(h, lam)
-        du = self.rate * (self.rest + (pull - self.pull) / self.radius)
+        du = law.rate * (law.rest + (pull - law.pull) / law.radius)
+        every = du if law.spread is None else np.concatenate((du[1] + (du[0] - du[1]) * law.spread, du))
         sin = lam / pull
         size = np.abs(np.expm1(cones.u)).max(axis=0) + cones.sin**2
-        wider = self.change + self.follow * du
-        change = np.maximum(np.abs(du), np.abs(wider)).max(axis=0) / size
-        change = np.maximum(change, np.abs(lam / (self.pull * cones.sin) - 1.0))
-        change = CURVED * change.max(axis=0, initial=0.0) * np.sqrt(self.share)
+        wider = law.change + law.follow * every
+        change = np.maximum(np.abs(du).max(axis=0), np.abs(wider).max(axis=0)) / size
+        change = np.maximum(change, np.abs(lam / (law.pull * cones.sin) - 1.0))
+        change = CURVED * change.max(axis=0, initial=0.0) * np.sqrt(law.share)
         u = cones.u + np.clip(du, -0.5, 0.5)
         natural = cones.natural + np.clip(wider, -0.5, 0.5)
-        return Cones(cones.which, u, natural, h / pull, sin, pull), change
+        return type(cones)(cones.which, u, natural, h / pull, sin, pull), change
 
 
 def _cut(panels: Grid, number: int) -> int:

@@ -1,0 +1,137 @@
+"""Answers for states that a cold start may miss, or find on another branch: the state is followed from rest.
+
+First many states together, with every point taut or wrinkled by itself; then each is solved to its tolerance with a cut
+at every edge of a wrinkled zone. Where the second fails, or the first ended close by, the state is approached alone, in
+steps that are solved with their cuts each. A state whose law is not convex along the whole profile is not an answer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import Array
+from model.membrane import continuation, convexity, tension_field
+from model.membrane.refinement import Answer, Start, refine
+from model.membrane.ritz import Problem
+
+TRACE_MODES = 10
+CLOSE = 2e-3  # of V^2: a path that ended so close below the wanted voltage is followed again, with cuts
+BACK = (0.03, 0.3)  # of V^2: where that begins
+STEP = 1e-5  # of V^2: its smallest step
+SOFT = 0.1  # stiffness below which a path that ends has met the loss of convexity
+ROUGH = 1e-6  # tolerance on the way
+
+
+class Ended:
+    """Why states have no answer."""
+
+    def __init__(self, states: int) -> None:
+        self.unstable = np.zeros(states, dtype=np.bool_)
+        self.steps = np.zeros(states, dtype=np.intp)
+
+
+def solve(problem: Problem, tolerance: float, *, relaxed: bool, sensitivities: bool) -> tuple[list[Answer], Ended]:
+    """Answers to the states that are on the branch from rest; for the others whether the branch ends before."""
+    states = len(problem.span)
+    path = continuation.follow(problem, TRACE_MODES, relaxed=relaxed)
+    ended = Ended(states)
+    ended.steps += path.steps
+    ended.unstable |= path.limit
+    answers: list[Answer] = []
+    done = np.zeros(states, dtype=np.bool_)
+    good = np.flatnonzero(path.reached)
+    if len(good):
+        found, spent = settled(
+            problem.take(good), tolerance, Start(path.grid.take(good), path.state.take(good)), relaxed, sensitivities
+        )
+        ended.steps[good] += spent
+        for answer in found:
+            answer.index = good[answer.index]
+            answer = _convex(problem, answer)
+            done[answer.index] = True
+            answers.append(answer)
+    end = 1.0 if problem.film.field is None else 2.0
+    for state in np.flatnonzero(~done & (path.progress > end - 1.0) & (path.progress > end - CLOSE)).tolist():
+        one = np.array([state])
+        last = Approach(problem.take(one), end, relaxed).run()
+        ended.steps[one] += last.steps
+        ended.unstable[one] |= last.limit
+        if not last.reached:
+            continue
+        found, spent = settled(problem.take(one), tolerance, last.begin, relaxed, sensitivities)
+        ended.steps[one] += spent
+        for answer in found:
+            answer.index = one[answer.index]
+            answers.append(_convex(problem, answer))
+    return answers, ended
+
+
+def settled(
+    problem: Problem, tolerance: float, begin: Start, relaxed: bool, sensitivities: bool = False
+) -> tuple[list[Answer], NDArray[np.intp]]:
+    """The states to their tolerance from ``begin``."""
+    if relaxed:
+        answers, _, spent = tension_field.solve(
+            problem, tolerance, sensitivities=sensitivities, begin=begin, careful=True
+        )
+    else:
+        answers, _, spent = refine(problem, tolerance, begin, sensitivities=sensitivities)
+    return answers, spent
+
+
+def _convex(problem: Problem, answer: Answer) -> Answer:
+    """The answers whose law is convex along the film."""
+    if problem.film.field is None or len(answer.index) == 0:
+        return answer
+    return answer.take(_margin(problem.take(answer.index), answer) > 0.0)
+
+
+def _margin(problem: Problem, answer: Answer) -> Array:
+    return convexity.margin(problem, convexity.stations(problem, answer.grid, answer.state, answer.lam))
+
+
+class Approach:
+    """One state followed alone over the last part of its way, every step solved with its cuts."""
+
+    def __init__(self, problem: Problem, end: float, relaxed: bool) -> None:
+        self.problem, self.end, self.relaxed = problem, end, relaxed
+        self.progress, self.steps = end, 0
+        self.reached = self.limit = False
+        self.margin = 1.0
+
+    def run(self) -> Approach:
+        """From where the state is easy to its own voltage, in steps that shorten where they fail."""
+        one = np.zeros(1, dtype=np.intp)
+        for back in BACK:
+            self.progress = self.end - back
+            part = continuation.at(self.problem, one, np.array([self.progress]))
+            path = continuation.follow(part, TRACE_MODES, relaxed=self.relaxed)
+            self.steps += int(path.steps[0])
+            if path.reached[0] and self._step(part, Start(path.grid, path.state)):
+                break
+        else:
+            return self
+        size = self.end - self.progress
+        while self.progress < self.end:
+            aim = min(self.progress + size, self.end)
+            if self._step(continuation.at(self.problem, one, np.array([aim])), self.begin):
+                self.progress = aim
+                size *= 2.0
+            else:
+                size *= 0.3
+                if size < STEP:
+                    # A path that ends where the law all but loses convexity has ended there.
+                    self.limit = self.margin < SOFT
+                    return self
+        self.reached = True
+        return self
+
+    def _step(self, part: Problem, begin: Start) -> bool:
+        answers, steps = settled(part, ROUGH, begin, self.relaxed)
+        self.steps += int(steps[0])
+        for answer in answers:
+            if len(answer.index) and (margin := float(_margin(part, answer)[0])) > 0.0:
+                self.begin, self.margin = Start(answer.grid, answer.state), margin
+                return True
+        return False
