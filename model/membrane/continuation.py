@@ -13,7 +13,8 @@ from model.membrane import convexity, refinement, ritz, tension_field
 from model.membrane.refinement import Iterate
 from model.membrane.ritz import Grid, Problem, State
 
-LEAST_STEP = 1e-6  # of the leg; a path that cannot be followed in such steps has ended
+LEAST_STEP = 1e-5  # of the leg; a path that cannot be followed in such steps has ended
+MOST_STEPS = 60  # of a path: one that needs more creeps up to its end
 FIRST_HEIGHT = 0.02  # share of h where the path begins
 CORRECTION = 0.3  # largest relative change of a slope by the corrector: more would be a jump to another branch
 SOFT = 0.1  # a path that ends with its lowest eigenvalue below this share of the first one has met a limit point
@@ -89,7 +90,7 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
     before, before_progress = State(current.c.copy(), current.w.copy()), progress.copy()
     size = np.full(states, 0.5)
     concave = np.zeros(states, dtype=np.bool_)
-    while True:
+    for _ in range(MOST_STEPS):
         active = np.flatnonzero(alive & (progress < end))
         if len(active) == 0:
             break

@@ -22,6 +22,7 @@ MOST_STEPS = 25
 # the next is the error of the coarser one, some times the error of the finer. Tests hold both factors to the truth.
 NEWTON_FACTOR = 0.3
 LEVEL_FACTOR = 0.5
+SOFT_LEVEL_FACTOR = 2.0  # near loss of convexity, where a finer resolution gains less
 ROUND_OFF = 1e-13
 # Of the meridional stress. A hoop stress below the first will not turn out positive at a finer resolution; one between
 # the second and zero is round-off.
@@ -74,9 +75,11 @@ def goal(tolerance: float) -> float:
 Number = TypeVar("Number", float, Array)
 
 
-def estimate(lam: Number, previous: Number, change: Number, tail: Number, tolerance: float) -> Number:
+def estimate(
+    lam: Number, previous: Number, change: Number, tail: Number, tolerance: float, factor: float = LEVEL_FACTOR
+) -> Number:
     """Estimated relative error of ``lam``, after ``previous`` at the resolution before; nan when there is none."""
-    refined = LEVEL_FACTOR * abs((lam - previous) / lam)
+    refined = factor * abs((lam - previous) / lam)
     return refined + NEWTON_FACTOR * change**2 + tail + (ROUND_OFF + LEAST_SHARE * tolerance)
 
 
@@ -218,6 +221,7 @@ def refine(
     *,
     sensitivities: bool = False,
     settle: Settle = newton,
+    factor: float = LEVEL_FACTOR,
     folded: list[tuple[NDArray[np.intp], Start]] | None = None,
 ) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
     """Solve a block of states to ``tolerance`` (relative, force), each with the resolution that it needs.
@@ -246,7 +250,7 @@ def refine(
             lost.append(index[~ok])
         modes = start.grid.table.modes
         if previous is not None:
-            error = estimate(lam, previous, result.change, result.tail, tolerance)
+            error = estimate(lam, previous, result.change, result.tail, tolerance, factor)
             settled = np.flatnonzero(ok & (error <= tolerance))
             if len(settled):
                 part = (problem, start, lam)

@@ -111,7 +111,7 @@ class SoftCones(Cones):
             wider = np.clip(law.relief.change + law.relief.rate * du, -0.3, 0.3)
             u = np.where(settled, u, u + du)
             natural = np.where(settled, natural, natural + wider)
-            settled |= (np.abs(du) + np.abs(wider)).max(axis=(0, 1)) < 1e-13
+            settled |= (np.abs(du) + np.abs(wider)).max(axis=(0, 1), initial=0.0) < 1e-13
             if settled.all():
                 break
         return Cones(self.which, u, natural, self.cos, self.sin, self.pull)

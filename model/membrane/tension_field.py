@@ -101,16 +101,18 @@ class Zones:
     where: Array  # (MOST_ZONES - 1, S): ln(R/b) of the changes, in order
 
 
-def zones(grid: Grid, state: State, at: Points, slack: float = 0.0) -> Zones:
+def zones(grid: Grid, state: State, at: Points, slack: float = 0.0, *, between: bool = True) -> Zones:
     """Zones of a state, by the hoop stress where taut and by the slack in the width where wrinkled.
 
     A sign against the element's own kind counts only beyond ``slack`` times the largest value: with cuts in place their
-    vicinity is round-off.
+    vicinity is round-off. Without ``between`` the points alone are asked: near loss of convexity the stretch is too
+    steep for the polynomial through them.
     """
     tension = at.law.t2 if state.relaxed is None else np.where(state.relaxed, at.hoop - at.log[1], at.law.t2)
     points, m, states = tension.shape
     whole = state.relaxed is None or bool((state.relaxed == state.relaxed[:1]).all())
-    if whole:
+    smooth = whole and between
+    if smooth:
         fine = fine_table(grid.table.modes) @ tension.reshape(points, m * states)
         fine = fine.reshape(FINE, m, states).swapaxes(0, 1).reshape(m * FINE, states)
         share = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, FINE)))
@@ -119,7 +121,7 @@ def zones(grid: Grid, state: State, at: Points, slack: float = 0.0) -> Zones:
         share = 0.5 * (1.0 + grid.table.xi)
     folded = fine < 0.0
     if slack > 0.0 and whole and state.relaxed is not None:
-        kind = np.repeat(state.relaxed[0], FINE, axis=0)
+        kind = np.repeat(state.relaxed[0], len(share), axis=0)
         bound = slack * np.maximum(fine.max(axis=0), -fine.min(axis=0))
         folded = np.where(kind, fine < bound, fine < -bound)
     flips = folded[1:] != folded[:-1]
@@ -326,6 +328,7 @@ def _round(
     """Cut the elements where the zones of ``start`` end, and solve; other zones than before: once more (``again``)."""
     here = problem.take(index)
     settler = partial(settle, kind=SoftCones, careful=True) if careful else settle
+    factor = refinement.SOFT_LEVEL_FACTOR if careful else refinement.LEVEL_FACTOR
     state = start.state
     mixed: NDArray[np.bool_] = np.zeros(len(index), dtype=np.bool_)
     if state.relaxed is not None:
@@ -336,7 +339,7 @@ def _round(
             continue
         part, grid, chosen = here.take(some), start.grid.take(some), state.take(some)
         at = ritz.evaluate(part, grid, chosen)
-        zone = zones(grid, chosen, at, slack=wrong_sign(tolerance))
+        zone = zones(grid, chosen, at, slack=wrong_sign(tolerance), between=not careful)
         pattern = 2 * zone.changes + zone.first
         for number in np.unique(pattern).tolist():
             changes, first = number // 2, bool(number % 2)
@@ -348,7 +351,9 @@ def _round(
             breaks, wrinkled = _cut(film, zone.where[:changes, of], first)
             modes = max(3, refinement.first_modes(float((breaks[1:] - breaks[:-1]).max()), tolerance))
             begun = remap(grid.take(of), chosen.take(of), at.log[1][..., of], breaks, modes, wrinkled)
-            done, missed, spent = refinement.refine(film, tolerance, begun, sensitivities=sensitivities, settle=settler)
+            done, missed, spent = refinement.refine(
+                film, tolerance, begun, sensitivities=sensitivities, settle=settler, factor=factor
+            )
             where = index[some[of]]
             lost.append(where[missed])
             steps[where] += spent
@@ -359,6 +364,7 @@ def _round(
                     answer.state,
                     ritz.evaluate(solved, answer.grid, answer.state),
                     slack=wrong_sign(tolerance),
+                    between=not careful,
                 )
                 same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
                 answer.index = where[answer.index]

@@ -1,0 +1,83 @@
+"""Where the relaxed law loses convexity, beyond the end of a branch, and where an answer once had a hole."""
+
+from __future__ import annotations
+
+from itertools import groupby, pairwise
+
+import numpy as np
+import pytest
+
+from model.material.materials import NAMED, Material
+from model.membrane.solve import Status, solve, solve_many
+from model.specimen import Specimen
+from model.stability.limits import slack_voltage
+from model.verification.continuation import follow
+
+PARKER = NAMED["parker-cao2018"]
+# Stiffens with the stretch: from about 528 V on its relaxed stress falls over stretches that its profile has.
+STIFFENING = Specimen(4e-3, 20e-3, 40e-6, 1.2, Material("s", (2e4, 3.0), (1.8, 14.0), 3.0))
+H = 20e-3
+
+
+def runs(status: np.ndarray) -> list[str]:
+    """The statuses in their order, repetitions left out."""
+    return [Status(value).name for value, _ in groupby(status.tolist())]
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-5, 1e-6])
+def test_no_state_where_the_relaxed_law_falls(tolerance: float) -> None:
+    assert solve(STIFFENING, H, 545.738, tolerance=tolerance, wrinkling="tension_field").status is Status.UNSTABLE
+
+
+def test_the_statuses_along_the_voltage_change_once() -> None:
+    voltage = np.arange(500.0, 636.0, 5.0)
+    found = solve_many(STIFFENING, H, voltage, tolerance=1e-6, wrinkling="tension_field")
+    assert runs(found.status) == ["WRINKLED", "UNSTABLE", "SLACK"]
+    # The law's own limit: finite elements that share nothing with the solver end at 528 V.
+    assert voltage[found.answered].max() == 525.0
+    assert np.all(np.diff(found.force[found.answered]) < 0.0)
+
+
+@pytest.mark.parametrize("voltage", [505.0, 522.0, 527.0])
+def test_one_answer_at_every_tolerance_up_to_the_loss_of_convexity(voltage: float) -> None:
+    found = [solve(STIFFENING, H, voltage, tolerance=t, wrinkling="tension_field") for t in (1e-4, 1e-6, 1e-8)]
+    assert [one.status for one in found] == [Status.WRINKLED] * 3
+    for one, other in pairwise(found):
+        assert abs(one.force / other.force - 1.0) <= one.error_estimate + other.error_estimate
+
+
+@pytest.mark.slow
+def test_the_answer_near_the_loss_of_convexity_is_that_of_finite_elements() -> None:
+    truth = follow(STIFFENING, H, 520.0, wrinkling="tension_field")
+    assert truth.reached
+    found = solve(STIFFENING, H, 520.0, tolerance=1e-6, wrinkling="tension_field")
+    assert found.force == pytest.approx(truth.force, rel=3.0 * truth.error + 2e-6)
+
+
+def test_a_taut_zone_about_to_vanish_leaves_no_hole() -> None:
+    film = Specimen(4e-3, 20e-3, 40e-6, 1.5, PARKER)
+    voltage = np.array([2650.0, 2655.0, 2655.660551501382, 2656.0, 2660.0])
+    found = solve_many(film, 6e-3, voltage, tolerance=1e-6, wrinkling="tension_field")
+    assert runs(found.status) == ["WRINKLED"]
+    assert found.force[2] == pytest.approx(0.0392320, abs=6e-8)
+    assert np.all(np.diff(found.force) < 0.0)
+    profile = solve(film, 6e-3, voltage[2], tolerance=1e-6, wrinkling="tension_field").profile()
+    assert np.count_nonzero(np.diff(profile.wrinkled)) == 2
+
+
+# High above the disk a stiffening film has solutions far out that no film at rest can reach.
+@pytest.mark.parametrize(
+    ("mu", "alpha", "lp", "h"),
+    [((1e4,), (3.0,), 1.0, 0.4), ((3e4, 100.0), (1.3, 5.0), 1.0, 0.02), ((1e4,), (2.3,), 2.0, 0.4)],
+)
+def test_nothing_is_answered_beyond_the_end_of_the_branch(
+    mu: tuple[float, ...], alpha: tuple[float, ...], lp: float, h: float
+) -> None:
+    film = Specimen(4e-3, 20e-3, 40e-6, lp, Material("high", mu, alpha, 3.0))
+    voltage = np.linspace(0.0, 1.05 * float(slack_voltage(film, np.array(h))), 40)
+    found = solve_many(film, h, voltage, tolerance=1e-6, wrinkling="tension_field")
+    order = runs(found.status)
+    assert order in (["TAUT", "WRINKLED", "UNSTABLE", "SLACK"], ["TAUT", "UNSTABLE", "SLACK"]), order
+    for one in (12, 24, 36):
+        alone = solve(film, h, float(voltage[one]), tolerance=1e-6, wrinkling="tension_field")
+        assert alone.status == found.status[one]
