@@ -78,6 +78,7 @@ class DeviceError(Exception):
         self.device = device
         self.what = what
         self.advice = advice
+        self.role = ""  # of the instrument in the scene; whoever polls it knows
 
 
 class DeviceLost(DeviceError):

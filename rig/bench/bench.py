@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Protocol, cast
 
+from drivers.links.link import DeviceError
 from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Sample, Stage
 from rig.bench.devices import Link, make_device, make_supply
 from rig.bench.opening import Opened
@@ -94,6 +95,9 @@ class Bench:
         self._polled_at = now
         try:
             return self.devices[role].poll(now)
+        except DeviceError as error:
+            error.role = role
+            raise
         finally:
             self._polled_at = None
 

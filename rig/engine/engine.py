@@ -20,7 +20,7 @@ from drivers.roles import HVSample, Sample
 from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.base.host import HostTime
 from rig.bench.bench import Bench
-from rig.engine.outcome import Outcome
+from rig.engine.outcome import NOT_SAFE_STATUS, Outcome
 from rig.engine.pause import pause
 from rig.engine.teardown import Rest, Teardown
 from rig.engine.watch import Watch, allowed_silence
@@ -49,7 +49,7 @@ OUTPUT_LIMIT_S = 3.0  # how long a supply may take after set-up to be measured o
 
 def _lets_ramp_down(error: Exception) -> bool:
     """Whether a run that ended so may ramp its voltage down; otherwise the output is taken off at once."""
-    silent = isinstance(error, DeviceSilent) and not error.device.startswith("hv")
+    silent = isinstance(error, DeviceSilent) and error.role not in ("", "hv")
     return silent or isinstance(error, Stopped | StaleData)
 
 
@@ -154,6 +154,8 @@ class Engine:
             self._next_turn,
             ended + SNAPSHOT_S - ROUNDING_S if snapshot else ended,
         )
+        if isinstance(error, Stopped):  # not before: a log that fails now stops nothing
+            self.recorder.operator("stops", "", self.control.source)
         if snapshot:
             self.recorder.snapshot(reason, ended, SNAPSHOT_S, SNAPSHOT_S)
         for role, device in self.bench.devices.items():
@@ -286,6 +288,7 @@ class Engine:
 
     def _pause(self, action: Action, done: float, total: float) -> None:
         """Stage standing, voltage down; once the operator continues, back to where the action begins."""
+        self.recorder.operator("pauses", self._doing, self.control.pausing)
         self.rig.event("operator", f"paused by {self.control.pausing} during {self._doing}")
         words = "the operator's pause"
         write_phase(self.rig, action, "pause", words, direction=action.direction, cycle=action.cycle, voltage=0.0)
@@ -362,7 +365,7 @@ class Engine:
     def _outcome(self, status: str, reason: str, rest: Rest) -> Outcome:
         recorder = self.recorder
         return Outcome(
-            status=status,
+            status=status if rest.safe else NOT_SAFE_STATUS,
             reason=reason,
             safe=rest.safe,
             standing=rest.standing,

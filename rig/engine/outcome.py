@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+NOT_SAFE_STATUS = "not safe"
+
 
 @dataclass(frozen=True)
 class Outcome:
     """Why the run ended, and the measured state it ended in.
 
-    ``status`` is one of complete, stopped, limit, fault. ``safe`` is True only when the output was *measured* below
-    60 V twice, or when the scene has no HV; ``standing`` only when the stage said that it stands still.
+    ``status`` is one of complete, stopped, limit, fault; or "not safe", which is worse than all of them, whenever
+    ``safe`` is False. ``reason`` says what ended the run in any case. ``safe`` is True only when the output was
+    *measured* below 60 V twice, or when the scene has no HV; ``standing`` only when the stage said that it stands.
     """
 
     status: str

@@ -22,11 +22,13 @@ def pause(rig: Rig, action: Action) -> Turns:
         rig.control.say("Paused: the stage stands" + (", the voltage is off." if rig.guard is not None else "."))
         while rig.control.pausing:
             yield
+        rig.recorder.operator("continues", "", "")
         rig.event("operator", "continues")
         with closing(regain(rig, action)) as turns:
             for _ in turns:
                 yield
                 if rig.control.pausing:
+                    rig.recorder.operator("pauses", "on the way back from a pause", rig.control.pausing)
                     rig.event("operator", f"paused again by {rig.control.pausing}")
                     break
             else:

@@ -152,6 +152,10 @@ class Recorder:
         """Write something that a reader of the log should know."""
         self._write("/event", self._clock.now(), severity=severity, source=source, message=message)
 
+    def operator(self, act: str, text: str, by: str) -> None:
+        """Write an act of the operator: "is asked", "answers", "pauses", "continues", "stops", "arms"."""
+        self._write("/operator", self._clock.now(), act=act, text=text, by=by)
+
     def identity(self, device: str, identity: Identity, settings: Mapping[str, str]) -> None:
         """Write who answered as a device, and what was read back from it."""
         t = self._clock.now()

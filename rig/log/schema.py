@@ -150,6 +150,15 @@ CHANNELS: dict[str, Channel] = {
             Field("message", "string", "what happened"),
         ),
     ),
+    "/operator": Channel(
+        "OperatorAct",
+        (
+            _T,
+            Field("act", "string", "is asked, answers, pauses, continues, stops or arms"),
+            Field("text", "string", "what he was asked, what he answered, what went on; of arming: what he confirmed"),
+            Field("by", "string", "who did it or in what way: the keyboard, a signal, another terminal, an option"),
+        ),
+    ),
     "/identity": Channel(
         "Identity",
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -51,6 +52,15 @@ class Step(NamedTuple):
     text: str
 
 
+class OperatorAct(NamedTuple):
+    """What the operator did at ``t``: as `rig.log.recorder.Recorder.operator` has it."""
+
+    t: float
+    what: str
+    text: str
+    by: str
+
+
 @dataclass(frozen=True)
 class Recording:
     """One log, ready to be replayed.
@@ -97,6 +107,28 @@ class Recording:
     def certificates(self) -> dict[str, Certificate]:
         """By role, those that the log holds."""
         return certificates_in(self.log)
+
+    @cached_property
+    def operator_acts(self) -> list[OperatorAct]:
+        """In the order of time."""
+        if "/operator" not in self.log.topics:
+            return self._acts_of_older_log()
+        rows = [row.fields for row in self.rows if row.topic == "/operator"]
+        return [OperatorAct(f["t_s"], f["act"], f["text"], f["by"]) for f in rows]
+
+    def _acts_of_older_log(self) -> list[OperatorAct]:
+        """Older logs say it in sentences that begin with one of these words."""
+        words = {"asked": "is asked", "answered": "answers", "paused": "pauses", "continues": "continues"}
+        said = [
+            (row.t, row.fields["message"].split()[0].rstrip(":"))
+            for row in self.rows
+            if row.topic == "/event" and row.fields["source"] == "operator"
+        ]
+        acts = [OperatorAct(t, words[word], "", "") for t, word in said if word in words]
+        reason = (self.log.outcome or {}).get("reason", "")
+        if reason.startswith("stopped by "):
+            acts.append(OperatorAct(math.inf, "stops", "", reason.removeprefix("stopped by ")))
+        return acts
 
     @cached_property
     def steps(self) -> list[Step]:

@@ -15,7 +15,7 @@ from rig.engine.outcome import Outcome
 from rig.operator.control import Answer, Control, Question
 from rig.protocol.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench
-from rig.replay.recording import Recording
+from rig.replay.recording import OperatorAct, Recording
 from rig.replay.steering import SteeredBench
 from rig.replay.verify import GUARDED
 
@@ -136,51 +136,47 @@ class _Operator(Control):
     """The operator of the recorded run: wants again what he wanted then, at the same instants."""
 
     def __init__(self, recording: Recording) -> None:
-        outcome = recording.log.outcome or {}
         given = [row.fields for row in recording.rows if row.topic == "/command"]
-        said = [
-            (row.t, row.fields["message"].split()[0].rstrip(":"))
-            for row in recording.rows
-            if row.topic == "/event" and row.fields["source"] == "operator"
-        ]
-        asked = [t for t, word in said if word == "asked"]
-        answered = [t for t, word in said if word == "answered"]
+        acts = recording.operator_acts
+        asked = [act.t for act in acts if act.what == "is asked"]
+        answered = [act for act in acts if act.what == "answers"]
         # Answers that came at once were given by nobody, and nobody was there to choose anything either.
         nobody = len(asked) == len(answered) and all(
-            late - t < AT_ONCE_S for t, late in zip(asked, answered, strict=True)
+            late.t - t < AT_ONCE_S for t, late in zip(asked, answered, strict=True)
         )
         super().__init__(unattended=AS_RECORDED if nobody else "")
         self.took_down = any((c["device"], c["command"]) == ("hv", "take_down") for c in given)
         self._questions, self._answers = deque(asked), deque(answered)
-        self._wishes = deque((t, word) for t, word in said if word in ("paused", "continues"))
-        self._answer_at = math.inf
-        self._stopped_by = outcome.get("reason", "").removeprefix("stopped by ")
+        self._coming: OperatorAct | None = None  # the answer to the question that is open
+        self._wishes = deque(act for act in acts if act.what in ("pauses", "continues"))
+        stopped = next((act for act in reversed(acts) if act.what == "stops"), None)
+        self._stopped_by = "" if stopped is None else stopped.by
         self._stop_at = math.inf
-        if outcome.get("status") == "stopped":
+        if stopped is not None:
             # Making safe begins with the stage, in the same turn.
             self._stop_at = max((c["t_s"] for c in given if c["command"] == "stop"), default=math.inf)
 
     def put(self, question: Question) -> None:
         super().put(question)
         asked = self._questions.popleft() if self._questions else 0.0
-        self._answer_at = self._answers.popleft() if self._answers else math.inf
-        if self._answer_at - asked < AT_ONCE_S:
-            self._reply(question)
+        self._coming = self._answers.popleft() if self._answers else None
+        if self._coming is not None and self._coming.t - asked < AT_ONCE_S:
+            self._reply(question, self._coming)
 
     def at(self, t: float) -> None:
         """What he has wanted by ``t``."""
-        if self.question is not None and self.answer is None and t >= self._answer_at:
-            self._reply(self.question)
-        while self._wishes and self._wishes[0][0] <= t:
-            if self._wishes.popleft()[1] == "paused":
+        if self.question is not None and self.answer is None and self._coming is not None and t >= self._coming.t:
+            self._reply(self.question, self._coming)
+        while self._wishes and self._wishes[0].t <= t:
+            if self._wishes.popleft().what == "pauses":
                 self.ask_pause(AS_RECORDED)
             else:
                 self.pausing = ""
         if t >= self._stop_at and not self.count:
             self.ask(self._stopped_by)
 
-    def _reply(self, question: Question) -> None:
-        self.answer = Answer(question.expected, AS_RECORDED)
+    def _reply(self, question: Question, recorded: OperatorAct) -> None:
+        self.answer = Answer(question.expected or recorded.text, AS_RECORDED)
 
 
 class _Again(ReplayBench):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from calibration.sensors.certificate import Certificate
 from rig.base.clock import Clock, calendar_now
-from rig.base.errors import FaultError
+from rig.base.errors import FaultError, LimitError, NotSafe, Stopped
 from rig.engine.engine import Engine
 from rig.engine.outcome import Outcome
 from rig.log import space
@@ -27,7 +27,7 @@ from rig.operator.control import Control, Keyboard, Source
 from rig.operator.signals import stop_on_signals
 from rig.protocol.experiment import Experiment, gains_of
 from rig.run.backend import Backend
-from rig.safety.guard import ADVICE
+from rig.safety.guard import ADVICE, NOT_SAFE
 from rig.scene.scene import Scene
 
 RECORDED_PACKAGES = ("dea-rig", "numpy", "scipy", "mcap", "protobuf", "pydantic", "pyserial", "python-can")
@@ -101,20 +101,39 @@ def run(
             bench.close()  # before the log ends: closing a device may say a last word on its wire
             if not engine.recorder.log_failed:
                 log.finish(outcome.as_text())
-        if error is None and not outcome.safe:
-            error = FaultError(f"The protocol ended, but the high voltage could not be proved off. {ADVICE}")
-        if error is None and not outcome.standing:
-            error = FaultError("The protocol ended, but the stage did not say that it stands. Cut its power.")
         if error is not None:
             raise error
+        if not (outcome.safe and outcome.standing):
+            raise worst(outcome, None)
     except Exception as error:
-        if outcome is not None:
-            error.add_note(f"State of the rig: {outcome.state}.{'' if outcome.safe else ' ' + ADVICE}")
-            error.add_note(f"The log so far: {out if out.exists() else log.part}")
-        raise
+        if outcome is None:
+            raise
+        told = worst(outcome, error)
+        told.add_note(f"The log so far: {out if out.exists() else log.part}")
+        told.add_note(f"State of the rig: {outcome.state}.")  # the last line: whatever else is said, this is seen
+        if told is error:
+            raise
+        raise told from error
     finally:
         bench.close()
     return outcome
+
+
+def worst(outcome: Outcome, error: Exception | None) -> Exception:
+    """What is told of a run that ended with ``error``, or without one in a state that is none: the worse of the two.
+
+    An output that was not measured off is worse than anything else, and a stage that may move than a stop or a limit.
+    """
+    if isinstance(error, NotSafe):
+        return error
+    ended = "The protocol had ended." if error is None else f"What ended the run: {outcome.reason}"
+    if not outcome.safe:
+        return NotSafe(f"{NOT_SAFE} {ADVICE} {ended}", device="hv", cause=outcome.reason)
+    if not outcome.standing and (error is None or isinstance(error, Stopped | LimitError)):
+        words = "The stage did not say that it stands; it may be moving. Cut its power."
+        return FaultError(f"{words} {ended}", device="stage", cause=outcome.reason)
+    assert error is not None
+    return error
 
 
 def _sources(out: Path) -> list[Source]:

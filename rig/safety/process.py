@@ -32,7 +32,7 @@ from drivers.links.link import DeviceError, DeviceLost
 from drivers.roles import HVSample, HVSupply
 from drivers.settings import SupplySettings
 from rig.base.clock import RealClock
-from rig.base.errors import FaultError, LimitError
+from rig.base.errors import FaultError, RigError
 from rig.base.host import HostTime
 from rig.bench.devices import ROLE, Link, make_supply
 from rig.log.errors import LogError
@@ -460,9 +460,9 @@ def pack_error(error: Exception) -> Message:
     """An error as plain text and numbers."""
     if isinstance(error, DeviceError):
         return {"kind": type(error).__name__, "device": error.device, "what": error.what, "advice": error.advice}
-    kind = type(error).__name__ if isinstance(error, LimitError | FaultError) else "FaultError"
-    text = str(error) if isinstance(error, LimitError | FaultError) else f"hv: internal error of the guard: {error!r}"
-    return {"kind": kind, "text": text}
+    if not isinstance(error, RigError):
+        error = FaultError(f"hv: internal error of the guard: {error!r}", device=ROLE)
+    return error.fields()
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from typing import Any
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, HVSupply, Identity, Sample
 from rig.base.clock import RealClock
-from rig.base.errors import FaultError, LimitError, RigError, StaleData
+from rig.base.errors import FaultError, from_fields
 from rig.bench.devices import ROLE, Link, make_supply
 from rig.bench.tap import Tap
 from rig.log.recorder import Severity
@@ -40,7 +40,6 @@ OPEN_AGAIN_S = 0.1
 GO_ON_S = 0.5  # how long to wait for the end of one that goes on trying, or hangs
 LEAVE_S = 5.0  # a guard that was told to go, and has nothing to take off, must have gone by then
 
-_ERRORS = {kind.__name__: kind for kind in (LimitError, FaultError, StaleData)}
 _DEVICE_ERRORS = {kind.__name__: kind for kind in (DeviceLost, DeviceSilent, DeviceRefused)}
 
 
@@ -432,6 +431,6 @@ class RemoteGuard:
 def unpack_error(message: Message) -> Exception:
     """The error that `rig.safety.process.pack_error` made into text."""
     kind = message["kind"]
-    if kind in _DEVICE_ERRORS or "device" in message:
+    if "what" in message:
         return _DEVICE_ERRORS.get(kind, DeviceError)(message["device"], message["what"], message["advice"])
-    return _ERRORS.get(kind, RigError)(message["text"])
+    return from_fields(message)

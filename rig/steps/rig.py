@@ -116,6 +116,7 @@ class Rig:
             raise FaultError(f"{volts:g} V asked for, but the scene has no HV.")
         if self.guard.state is GuardState.SAFE:
             self.arming.check(volts)
+            self.recorder.operator("arms", self.arming.confirmed, self.arming.requested)
             self.event("hv", f"armed by two acts: {self.arming.requested}; {self.arming.confirmed}")
             self.guard.arm()
         h = self.recorder.displacement if math.isfinite(self.recorder.contact) else 0.0
@@ -138,6 +139,7 @@ class Rig:
 
         ``by_hand`` is what is to be done for it, where `hands` can do it in his place; what they read is the answer.
         """
+        self.recorder.operator("is asked", question.text, "")
         self.event("operator", f"asked: {question.text}")
         self.control.put(question)
         if by_hand is not None and self.hands is not None:
@@ -148,5 +150,6 @@ class Rig:
                 yield
         finally:
             self.control.withdraw()
+        self.recorder.operator("answers", answer.text, answer.source)
         self.event("operator", f"answered: {answer}")
         return answer

@@ -36,6 +36,7 @@ SAMPLES: dict[str, dict[str, Any]] = {
     },
     "/reference": {"name": "force_zero", "value": 0.0123, "standard_uncertainty": 1e-5, "unit": "mV/V"},
     "/command": {"device": "stage", "command": "move_to", "argument": "2.0 mm"},
+    "/operator": {"act": "answers", "text": "yes, by Jove: 3", "by": "the keyboard"},
     "/identity": {"device": "hv", "model": "iseg, serial 3", "serial": "484216", "firmware": ""},
     "/setting": {"device": "hv", "name": "ramp_percent_per_s", "value": "10"},
     "/certificate_problem": {"device": "hv", "problem": "valid until 2026-01-01"},

@@ -42,7 +42,10 @@ def test_the_same_protocol_gives_the_same_samples(tmp_path, name):
     assert done.exit_code == 0, done.output
     then, now = load_recording(LOGS / name / "log.mcap"), load_recording(log)
     assert now.log.metadata["run"]["bench"] == "replay of log.mcap"
-    assert [(row.topic, row.payload) for row in now.rows] == [(row.topic, row.payload) for row in then.rows]
+    # Who answered, settings, counters and the operator's acts stand in sentences in older logs, in fields today.
+    told = {"/event", "/identity", "/setting", "/counter", "/certificate_problem", "/operator"}
+    today, recorded = ([(row.topic, row.payload) for row in one.rows if row.topic not in told] for one in (now, then))
+    assert today == recorded and len(today) > 1000
 
 
 def test_another_request_is_refused_with_both_and_the_step(tmp_path):
