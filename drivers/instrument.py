@@ -51,8 +51,9 @@ class Instrument:
         return issubclass(self.settings, CanSettings)
 
     def arguments(self, settings: InstrumentSettings) -> dict[str, Any]:
-        """What a scene says to the driver."""
-        return settings.model_dump(include=set(signature(self.device).parameters))
+        """What a scene says to the driver: keys, and properties of the settings, that are named like its arguments."""
+        named = [key for key in signature(self.device).parameters if key not in ("name", "link")]
+        return {key: getattr(settings, key) for key in named if hasattr(settings, key)}
 
     def make(self, name: str, link: Any, settings: InstrumentSettings) -> Device:
         """The driver on its link; the first poll sends the first byte."""

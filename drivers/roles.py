@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Flag, auto
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
 class SampleFlag(Flag):
@@ -167,6 +167,16 @@ class DisplacementSensor(Device, Protocol):
 
     @property
     def rate(self) -> float: ...
+
+
+@runtime_checkable
+class Renewed(Protocol):
+    """A supply with a watchdog that takes the output off by itself some time after the last `renew`.
+
+    Only the code that decides on the output calls it, each time it has decided.
+    """
+
+    def renew(self) -> None: ...
 
 
 class HVSupply(Device, Protocol):

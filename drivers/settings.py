@@ -135,6 +135,25 @@ class CanSettings(InstrumentSettings):
         return open_bus(name, self.interface, self.can_channel, self.bitrate, adopt=adopt)
 
 
+class TcpSettings(InstrumentSettings):
+    """What every instrument on a network has."""
+
+    place_keys: ClassVar[tuple[str, ...]] = ("host",)
+
+    host: str | None = Field(
+        default=None,
+        min_length=1,
+        description='Address of the device, e.g. "192.168.1.207"; its maker\'s software shows it. Absent: simulated.',
+    )
+    tcp_port: int = Field(default=502, ge=1, le=65_535, description="TCP port on which the device listens.")
+
+    def open(self, name: str, adopt: Sequence[int] = ()) -> ByteLink:
+        from drivers.links.tcp_link import TcpLink
+
+        assert self.host is not None
+        return TcpLink(name, self.host, self.tcp_port, adopt=adopt)
+
+
 class StageSettings(InstrumentSettings):
     """What every stage has."""
 

@@ -208,7 +208,10 @@ class Shvps:
             )
         if volts != round(volts):
             raise DeviceRefused(self._label, f"a set-point of {volts!r} V is no whole number", "Give whole volts.")
-        self._command(self._aim(round(volts)))
+        if self._on and self._dialogue.idle:  # nothing is to be sent before the ramp's next step
+            self._target, self._stepped_at = round(volts), None
+        else:
+            self._command(self._aim(round(volts)))
 
     def switch_on(self) -> None:
         """Switch on at 0 V; the output then ramps to the set-point."""

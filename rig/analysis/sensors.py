@@ -117,7 +117,7 @@ def calibrate(path: Path, quantity: Quantity) -> Calibration:
         serial=stated.serial,
         made=datetime.fromtimestamp(run.log.start_ns * 1e-9, UTC).date(),
         data_sha256=sha256(path.read_bytes()).hexdigest(),
-        reading_unit=run.log.metadata.get("units", {}).get("force", "mV/V")
+        reading_unit=run.log.metadata.get("units", {}).get("/force/sample reading", "mV/V")
         if quantity == "force"
         else UNIT.get(quantity, ""),
         path=path,

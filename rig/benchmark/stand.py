@@ -150,11 +150,11 @@ class Stand:
         for role, keys in self.bench.ports.items():
             key = "can_channel" if "can_channel" in keys else "port"
             name = self.folder / f"tty-{role}"
-            if name.is_symlink() and str(name.readlink()) != keys[key]:
+            if name.is_symlink() and str(name.readlink()) != str(keys[key]):
                 name.unlink()
             if not name.is_symlink():
-                name.symlink_to(keys[key])
-            named[role] = {**keys, key: str(name)}
+                name.symlink_to(str(keys[key]))
+            named[role] = {**{of: str(value) for of, value in keys.items()}, key: str(name)}
         return named
 
     def pull(self, role: str) -> float:

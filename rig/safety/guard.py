@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from enum import Enum, Flag
 from typing import TYPE_CHECKING, TypeAlias
 
-from drivers.roles import HVFlag, HVSample, HVSupply
+from drivers.roles import HVFlag, HVSample, HVSupply, Renewed
 from rig.base.errors import FaultError, LimitError, StaleData
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limit, Limits
@@ -290,6 +290,8 @@ class Guard:
             except LimitError as error:
                 self.kill(str(error))
                 raise
+        if isinstance(self._supply, Renewed):
+            self._supply.renew()
 
     def _judge_engine(self, now: float) -> None:
         if self._alive_at is None:

@@ -51,7 +51,7 @@ class ServedBench:
         self._thread = threading.Thread(target=self._serve, name="simulated bench", daemon=True)
 
     @property
-    def ports(self) -> Mapping[str, dict[str, str]]:
+    def ports(self) -> Mapping[str, dict[str, str | int]]:
         """As ``dea-rig sim`` prints them."""
         return self._server.ports
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import socket
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from rig.base.clock import Clock
 from rig.sim.slcan import SlcanAdapter
-from rig.sim.wire import ByteWire, FrameWire, WireGone
+from rig.sim.wire import ByteWire, FrameWire, TcpWire, WireGone
 
 STEP_S = 0.002  # bytes that arrive by themselves are handed over in bundles of this length, as USB does
 IDLE_S = 0.05  # how often `stop` is asked when nothing happens
@@ -86,6 +87,66 @@ class _Port:
         self.master = self._slave = -1
 
 
+class _TcpPort:
+    """A TCP port on this machine only. One host is served at a time; the next is taken when it has left."""
+
+    def __init__(self, line: _Line, wire: TcpWire) -> None:
+        self.line = line
+        self.wire = wire
+        self.lost_bytes = 0
+        self._listening = socket.create_server(("127.0.0.1", 0), backlog=2)
+        self._listening.setblocking(False)
+        self.number = int(self._listening.getsockname()[1])
+        self._host: socket.socket | None = None
+
+    @property
+    def is_open(self) -> bool:
+        return True
+
+    @property
+    def master(self) -> int:
+        """Descriptor to wait on."""
+        return (self._host or self._listening).fileno()
+
+    def open(self) -> None:
+        """It listens always."""
+
+    def read(self) -> bytes:
+        if self._host is None:
+            with contextlib.suppress(OSError):
+                self._host, _ = self._listening.accept()
+                self._host.setblocking(False)
+                self._host.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return b""
+        try:
+            data = self._host.recv(CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._leave()
+        return data
+
+    def write(self, data: bytes) -> None:
+        written = 0
+        if self._host is not None:
+            with contextlib.suppress(OSError):
+                written = self._host.send(data)
+        self.lost_bytes += len(data) - written
+
+    def _leave(self) -> None:
+        host, self._host = self._host, None
+        if host is not None:
+            host.close()
+
+    def close(self) -> None:
+        self._leave()
+        if self.wire.gone:
+            return  # the cable is out; it goes on listening
+        self._listening.close()
+
+
 class Served(Protocol):
     """A bench in memory, simulated or replayed: instruments by role, their wires, and time."""
 
@@ -117,29 +178,25 @@ class Server:
     def __init__(self, bench: Served, clock: Clock) -> None:
         self._bench = bench
         self._clock = clock
-        self._ports: dict[str, _Port] = {}
+        self._ports: dict[str, _Port | _TcpPort] = {}
         bench.prepare()
         try:
             for role in bench.instruments:
                 wire = bench.wire(role)
                 line: _Line = SlcanAdapter(wire) if isinstance(wire, FrameWire) else _Serial(wire)
-                self._ports[role] = _Port(line, wire)
+                self._ports[role] = _TcpPort(line, wire) if isinstance(wire, TcpWire) else _Port(line, wire)
         except BaseException:
             self.close()
             raise
 
     @property
-    def ports(self) -> Mapping[str, dict[str, str]]:
-        """By role, the keys of a scene that lead to the instrument: ``port``, or ``interface`` and ``can_channel``.
+    def ports(self) -> Mapping[str, dict[str, str | int]]:
+        """By role, the keys of a scene that lead to the instrument: ``port``, or ``interface`` and ``can_channel``, or
+        ``host`` and ``tcp_port``.
 
         A wire that vanished and came back has a new name, as a replugged adapter may have.
         """
-        return {
-            role: {"interface": "slcan", "can_channel": port.name}
-            if isinstance(port.wire, FrameWire)
-            else {"port": port.name}
-            for role, port in self._ports.items()
-        }
+        return {role: _place(port) for role, port in self._ports.items()}
 
     @property
     def lost_bytes(self) -> dict[str, int]:
@@ -167,7 +224,7 @@ class Server:
             for descriptor in ready:
                 self._take(open_ports[descriptor], now)
 
-    def _hand_over(self, port: _Port, now: float) -> None:
+    def _hand_over(self, port: _Port | _TcpPort, now: float) -> None:
         if port.wire.gone:
             port.close()
             return
@@ -177,7 +234,7 @@ class Server:
         if data:
             port.write(data)
 
-    def _take(self, port: _Port, now: float) -> None:
+    def _take(self, port: _Port | _TcpPort, now: float) -> None:
         data = port.read()
         if not data:
             return
@@ -190,3 +247,11 @@ class Server:
         """Close all ports; hosts see them vanish."""
         for port in self._ports.values():
             port.close()
+
+
+def _place(port: _Port | _TcpPort) -> dict[str, str | int]:
+    if isinstance(port, _TcpPort):
+        return {"host": "127.0.0.1", "tcp_port": port.number}
+    if isinstance(port.wire, FrameWire):
+        return {"interface": "slcan", "can_channel": port.name}
+    return {"port": port.name}

@@ -16,7 +16,7 @@ from model.material.materials import Material
 from model.material.ogden import Ogden
 from rig.base.law_tables import any_law, law_table, law_values
 from rig.base.table import Table
-from rig.sim.wire import ByteWire, FrameWire
+from rig.sim.wire import ByteWire, FrameWire, TcpWire
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -111,6 +111,15 @@ class BusTruth(InstrumentTruth):
 
     def wire(self) -> FrameWire:
         return FrameWire(self.latency_ms * 1e-3, self.bitrate)
+
+
+class NetworkTruth(InstrumentTruth):
+    """What every simulated instrument on a network has."""
+
+    latency_ms: NotNegative = Field(default=0.5, description="Time that every message takes, each way (ms).")
+
+    def wire(self) -> TcpWire:
+        return TcpWire(self.latency_ms * 1e-3)
 
 
 class StageTruth(InstrumentTruth):

@@ -132,6 +132,10 @@ class ByteWire:
         self.gone = False
 
 
+class TcpWire(ByteWire):
+    """A TCP connection: bytes, as on a serial line."""
+
+
 class FrameWire:
     """A CAN bus with the host and one node on it; classic frames ``(id, data)`` with 11-bit identifiers.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
@@ -56,7 +56,42 @@ shvps        baud                    115200    (0     -
 shvps        ramp_V_per_s            100.0     (0     -
 shvps        parallel_capacitance_nF 0.0       0      -
 shvps        poll_rate_Hz            10.0      (0     20
+labjack-amplifier     timeout_s                0.25  (0  10
+labjack-amplifier     tcp_port                 502   1   65535
+labjack-amplifier     ramp_V_per_s             100.0 (0  -
+labjack-amplifier     parallel_capacitance_nF  0.0   0   -
+labjack-amplifier     gain_V_per_V             None  (0  -
+labjack-amplifier     voltage_monitor_V_per_V  None  (0  -
+labjack-amplifier     current_monitor_uA_per_V None  (0  -
+labjack-amplifier     full_scale_V             None  (0  -
+labjack-amplifier     current_limit_uA         None  (0  -
+labjack-amplifier     slew_V_per_us            None  (0  -
+labjack-amplifier     dac                      0     0   1
+labjack-amplifier     voltage_ain              0     0   13
+labjack-amplifier     current_ain              1     0   13
+labjack-amplifier     enable_line              None  0   22
+labjack-amplifier     watchdog_s               3     1   60
+labjack-amplifier     proof_V                  50.0  (0  55
+labjack-amplifier     proof_tolerance          0.15  (0  0.5
+labjack-amplifier     settle_s                 0.2   0   5
+labjack-amplifier     poll_rate_Hz             20.0  2   100
+labjack-force         timeout_s                0.25  (0  10
+labjack-force         tcp_port                 502   1   65535
+labjack-force         ain                      2     0   13
+labjack-force         newtons_per_V            needed - -
+labjack-force         rate_Hz                  50.0  (0  200
+labjack-displacement  timeout_s                0.25  (0  10
+labjack-displacement  tcp_port                 502   1   65535
+labjack-displacement  ain                      3     0   13
+labjack-displacement  mm_per_V                 needed - -
+labjack-displacement  rate_Hz                  50.0  (0  200
 """
+# What must be said beside.
+NEEDED: dict[str, dict[str, Any]] = {
+    "labjack-amplifier": {"preset": "trek-610e"},
+    "labjack-force": {"newtons_per_V": 1.0},
+    "labjack-displacement": {"mm_per_V": 1.0},
+}
 ROWS = [line.split() for line in DOCUMENTED.strip().splitlines()]
 
 
@@ -65,13 +100,27 @@ def settings_of(driver: str) -> type[InstrumentSettings]:
 
 
 def numeric(field: FieldInfo) -> bool:
-    kinds = {field.annotation, *get_args(field.annotation)}
-    return bool(kinds & {int, float})
+    return bool(kinds(field.annotation) & {int, float})
+
+
+def kinds(annotation: Any) -> set[Any]:
+    """The types that an annotation is made of; constants are none."""
+    if get_origin(annotation) is Literal:
+        return set()
+    arguments = get_args(annotation)
+    return {annotation} | {kind for one in arguments if isinstance(one, type) or get_args(one) for kind in kinds(one)}
+
+
+def usual(driver: str) -> dict[str, Any]:
+    """The keys that must be there."""
+    return {"driver": driver, "certificate": "c.toml", **NEEDED.get(driver, {})}
 
 
 def accepts(driver: str, key: str, value: Any) -> bool:
     """Whether a scene may say it, the other keys being as usual."""
-    table = {"driver": driver, "certificate": "c.toml", key: value}
+    table = {**usual(driver), key: value}
+    if key in ("voltage_ain", "current_ain"):
+        table["current_ain" if key == "voltage_ain" else "voltage_ain"] = 5
     if driver == "cia404" and key == "factor":
         table["unit"] = "N"
     try:
@@ -102,8 +151,8 @@ def test_every_number_is_documented_here() -> None:
 @pytest.mark.parametrize(("driver", "key", "default", "low", "high"), ROWS)
 def test_default_and_range_are_the_documented_ones(driver: str, key: str, default: str, low: str, high: str) -> None:
     field = settings_of(driver).model_fields[key]
-    assert repr(field.default) == default
-    whole = int in {field.annotation, *get_args(field.annotation)}
+    assert repr(field.default) == default or (field.is_required() and default == "needed")
+    whole = int in kinds(field.annotation)
 
     def beside(text: str, way: float) -> Any:
         number = float(text)
@@ -125,7 +174,7 @@ def test_default_and_range_are_the_documented_ones(driver: str, key: str, defaul
 @pytest.mark.parametrize("one", INSTRUMENTS, ids=lambda one: one.driver)
 def test_no_key_of_another_instrument_is_taken(one: Instrument) -> None:
     keys = {name for other in INSTRUMENTS for name in other.settings.model_fields} - set(one.settings.model_fields)
-    table = {"driver": one.driver, "certificate": "c.toml"}
+    table = usual(one.driver)
     TypeAdapter(one.settings).validate_python(table)
     for key in (*keys, "no_such_key"):
         with pytest.raises(ValidationError, match="Extra inputs"):
@@ -134,7 +183,7 @@ def test_no_key_of_another_instrument_is_taken(one: Instrument) -> None:
 
 @pytest.mark.parametrize("one", INSTRUMENTS, ids=lambda one: one.driver)
 def test_what_names_its_port_makes_it_connected(one: Instrument) -> None:
-    table: dict[str, Any] = {"driver": one.driver, "certificate": "c.toml"}
+    table = usual(one.driver)
     assert not one.settings.model_validate(table).connected
     where = {"port": "p", "interface": "virtual", "can_channel": "c", "host": "127.0.0.1"}
     placed = one.settings.model_validate({**table, **{key: where[key] for key in one.settings.place_keys}})

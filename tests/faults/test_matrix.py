@@ -23,6 +23,9 @@ from drivers.instruments.cia404.device import CiA404
 from drivers.instruments.gsv8.device import GSV8
 from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.instruments.keyence_lkg import KeyenceLKG
+from drivers.instruments.labjack import PRESETS
+from drivers.instruments.labjack.amplifier import LabJackAmplifier
+from drivers.instruments.labjack.analog_input import AnalogDisplacement, AnalogForce
 from drivers.instruments.shvps import Shvps
 from drivers.instruments.zaber.device import ZaberStage
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
@@ -57,8 +60,17 @@ DRIVERS: dict[str, Callable[..., Any]] = {
     "keyence-lkg": KeyenceLKG,
     "iseg-edcp": IsegEDCP,
     "shvps": Shvps,
+    "labjack-amplifier": LabJackAmplifier,
+    "labjack-force": AnalogForce,
+    "labjack-displacement": AnalogDisplacement,
 }
-OPTIONS: dict[str, dict[str, float]] = {"cia404": {"node": 5}, "keyence-lkg": {"poll_rate_Hz": 50.0}}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "cia404": {"node": 5},
+    "keyence-lkg": {"poll_rate_Hz": 50.0},
+    "labjack-amplifier": {"amplifier": PRESETS["trek-610e"], "enable_line": 0},
+    "labjack-force": {"newtons_per_V": 0.2},
+    "labjack-displacement": {"mm_per_V": 4.0},
+}
 QUIET: dict[str, dict[str, Any]] = {
     "zaber": {"start_position_mm": 0.0, "referenced_at_start": True},
     "gsv8": {"noise_fraction": 0.0},
@@ -66,6 +78,9 @@ QUIET: dict[str, dict[str, Any]] = {
     "keyence-lkg": {"noise_um": 0.0},
     "iseg-edcp": {"voltage_noise_V": 0.0, "current_noise_nA": 0.0},
     "shvps": {"voltage_noise_V": 0.0},
+    "labjack-amplifier": {"input_noise_mV": 0.0},
+    "labjack-force": {"input_noise_mV": 0.0, "noise_fraction": 0.0},
+    "labjack-displacement": {"input_noise_mV": 0.0, "noise_um": 0.0},
 }
 TOLERANCE = {"stage": 1e-6, "force": 1e-6, "displacement": 1e-6, "hv": 1.5}
 ROUND_TRIP_S = 0.14  # half of the longest: by so much a sample's time may be off
@@ -182,6 +197,28 @@ REQUIRED: dict[tuple[str, str], Required] = {
     ("shvps", "breakdown"): AS_IT_IS,
     ("shvps", "over_current"): AS_IT_IS,
     ("shvps", "sag"): AS_IT_IS,
+    **{
+        (driver, kind): required
+        for driver in ("labjack-amplifier", "labjack-force", "labjack-displacement")
+        for kind, required in {
+            "delay": now_and_then(0.05, ("unexpected_replies",), ("retries",), value=0.4),
+            "split": now_and_then(0.5),
+            "merge": now_and_then(0.05, ("retries",), ("unexpected_replies",)),
+            "silent": SILENT,
+            "vanish": LOST,
+            "alert": Required((("unexpected_replies",),), keys=(("value", 0.0), ("probability", 0.5))),
+            "reset": SILENT,
+            "freeze": AS_IT_IS,
+            "wrong_status": Required(error=DeviceRefused, words="refused: it failed", within_s=0.2),
+        }.items()
+    },
+    ("labjack-force", "saturate"): Required((("over_range",),), flag=SampleFlag.OVER_RANGE),
+    ("labjack-displacement", "saturate"): Required((("over_range",),), flag=SampleFlag.OVER_RANGE),
+    ("labjack-amplifier", "saturate"): Required((("over_range",),), flag=HVFlag.TRIPPED),
+    ("labjack-amplifier", "stuck_on"): AS_IT_IS,
+    ("labjack-amplifier", "breakdown"): AS_IT_IS,
+    ("labjack-amplifier", "over_current"): AS_IT_IS,
+    ("labjack-amplifier", "sag"): AS_IT_IS,
 }
 # Where the protocol cannot show it: a frozen value looks like any other, and without a checksum so does a changed
 # digit or bit of a value. How large the part of wrong values may be while one message in five or twenty is damaged.
@@ -189,13 +226,25 @@ BLIND = {
     ("zaber", "freeze"): 1.0,
     ("iseg-edcp", "freeze"): 1.0,
     ("shvps", "freeze"): 1.0,
+    ("labjack-amplifier", "freeze"): 1.0,
+    ("labjack-amplifier", "saturate"): 1.0,  # told by the flag
     ("gsv8", "corrupt"): 0.1,
     ("cia404", "corrupt"): 0.15,
     ("keyence-lkg", "corrupt"): 0.15,
     ("iseg-edcp", "corrupt"): 0.35,
     ("shvps", "corrupt"): 0.1,
 }
-PLAUSIBLE = {"zaber": 0.2, "gsv8": 7.0, "cia404": 1e4, "keyence-lkg": 80e-3, "iseg-edcp": 12e3, "shvps": 6e3}
+PLAUSIBLE = {
+    "zaber": 0.2,
+    "gsv8": 7.0,
+    "cia404": 1e4,
+    "keyence-lkg": 80e-3,
+    "iseg-edcp": 12e3,
+    "shvps": 6e3,
+    "labjack-amplifier": 22e3,
+    "labjack-force": 2.2,
+    "labjack-displacement": 44e-3,
+}
 
 
 def value_of(sample: Sample) -> float:

@@ -25,7 +25,12 @@ Tell = Callable[..., Any]  # of conftest.Story
 RAMP_DOWN_S = 1000 / 300 + 1.0  # from 1000 V at the scene's 300 V/s, and a second for polling
 AT_ONCE_S = 1.5
 ROLE_OF = {one.driver: one.role for one in registered().twins.values()}
-SCENE_OF = {"cia404": "other-instruments", "shvps": "other-instruments"}  # the others are in cone-4mm
+LABJACK = ("labjack-amplifier", "labjack-force", "labjack-displacement")
+SCENE_OF = {  # the others are in cone-4mm
+    "cia404": "other-instruments",
+    "shvps": "other-instruments",
+    **dict.fromkeys(LABJACK, "analogue-amplifier"),
+}
 
 # What is tolerated: a little of everything that happens on a long wire, one after the other in one run; and counters of
 # which at least one of each group shows it.
@@ -61,6 +66,15 @@ LITTLE: dict[str, dict[str, dict[str, float]]] = {
         "drop": {"probability": 0.02},
         "merge": {"probability": 0.02},
     },
+    **{
+        driver: {
+            "delay": {"value": 0.01},
+            "split": {"value": 0.01},
+            "merge": {"probability": 0.01},
+            "alert": {"value": 0.0, "probability": 0.3},
+        }
+        for driver in LABJACK
+    },
 }
 COUNTED = {
     "zaber": ("retries", "unexpected_replies", "alerts"),
@@ -69,6 +83,7 @@ COUNTED = {
     "keyence-lkg": ("retries", "unexpected_replies", "pushed"),
     "iseg-edcp": ("retries", "unexpected_frames", "log_ons"),
     "shvps": ("retries", "unexpected_replies"),
+    **dict.fromkeys(LABJACK, ("retries", "unexpected_replies")),
 }
 
 OFF, NOT_SAFE, EITHER = "off", "not safe", "either"
@@ -96,6 +111,22 @@ ENDS: dict[tuple[str, str], str] = {
         OFF,
     ),
     **dict.fromkeys([("shvps", kind) for kind in ("reset", "wrong_status", "breakdown", "over_current", "sag")], OFF),
+    **dict.fromkeys(
+        [
+            (sensor, kind)
+            for sensor in ("labjack-force", "labjack-displacement")
+            for kind in ("silent", "vanish", "reset", "saturate", "freeze", "wrong_status")
+        ],
+        OFF,
+    ),
+    **dict.fromkeys([("labjack-amplifier", kind) for kind in ("reset", "breakdown", "over_current", "sag")], OFF),
+    **dict.fromkeys(
+        [
+            ("labjack-amplifier", kind)
+            for kind in ("silent", "vanish", "stuck_on", "freeze", "saturate", "wrong_status")
+        ],
+        NOT_SAFE,
+    ),
     # Nothing proves the output off of a supply that cannot be heard, does not obey, or shows the same for ever ...
     ("iseg-edcp", "wrong_status"): NOT_SAFE,  # ... or says that its channel is on and ramps
     **dict.fromkeys(

@@ -23,6 +23,12 @@ FILM = Specimen(
 GOES_WELL = {"round_trips", "round_trip_sum_us", "round_trip_max_us", "log_ons", "alerts", "infos"}
 # The driver throws away what was in the line before it began; the amplifier has been streaming by then.
 AT_START = {"gsv8": {"dropped_bytes", "ignored_frames"}}
+MORE_KEYS: dict[str, dict[str, Any]] = {
+    "cia404": {"node": 5},
+    "labjack-amplifier": {"preset": "trek-610e"},
+    "labjack-force": {"newtons_per_V": 1.0},
+    "labjack-displacement": {"mm_per_V": 1.0},
+}
 
 
 @pytest.mark.parametrize("driver", [one.driver for one in twins().twins.values()])
@@ -34,8 +40,7 @@ def test_nothing_is_counted_wrong_on_clean_data(driver: str) -> None:
     link: Any = MemoryFrameLink(role, wire, clock) if isinstance(wire, FrameWire) else MemoryByteLink(role, wire, clock)
     instrument = registered().instruments[role, driver]
     keys: dict[str, Any] = {"driver": driver, "certificate": "c.toml"}
-    if driver == "cia404":
-        keys["node"] = 5
+    keys |= MORE_KEYS.get(driver, {})
     device = instrument.make(role, link, instrument.settings.model_validate(keys))
     samples: list[Any] = []
     while clock.now() < 20.0:

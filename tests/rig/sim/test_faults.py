@@ -367,6 +367,9 @@ PROBE = {
     "iseg-edcp": "201#1208",
     "cia404": "605#4000100000000000",
     "gsv8": b"",
+    **dict.fromkeys(
+        ("labjack-amplifier", "labjack-force", "labjack-displacement"), bytes.fromhex("000100000006010300000002")
+    ),
 }
 TWINS_BY_DRIVER = {one.driver: (one.role, one.truth) for one in registered().twins.values()}
 
