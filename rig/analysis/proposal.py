@@ -93,7 +93,7 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
         When the scene cannot be used, or the time does not suffice for any two places.
     """
     scene, _ = load_scene(scene_path)
-    certificates = certificates_of(scene, scene_path.parent)
+    certificates = certificates_of(scene, scene_path)
     specimen = scene.specimen.specimen()
     specimen = specimen if film is None else specimen.with_material(film)
     if terms == 1 and len(specimen.material.mu) > 1:

@@ -48,6 +48,7 @@ def read_bytes(path: Path, kind: str, most: int = MAX_BYTES) -> bytes:
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(f"{path}: the {kind} file cannot be read: {why}.") from None
+    _check_beginning(data, str(path), kind)
     if len(data) > most:
         raise ConfigError(f"{path}: larger than {most // 1024} kB; this is not a {kind} file.")
     return data
@@ -55,9 +56,7 @@ def read_bytes(path: Path, kind: str, most: int = MAX_BYTES) -> bytes:
 
 def decode(data: bytes, source: str, kind: str) -> str:
     """The text in the bytes of a file; ``source`` names it in errors. Raises `ConfigError`."""
-    for beginning, what in BEGINNINGS.items():
-        if data.startswith(beginning):
-            raise ConfigError(f"{source}: this is {what}, not a {kind} file.")
+    _check_beginning(data, source, kind)
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise ConfigError(f"{source}: not UTF-8 text but UTF-16, which some editors call Unicode. Save it as UTF-8.")
     if b"\0" in data:
@@ -70,3 +69,9 @@ def decode(data: bytes, source: str, kind: str) -> str:
             f"{source}: not UTF-8 text (byte 0x{data[error.start]:02X} in line {line}). It was probably saved in an "
             "older encoding, such as Latin-1 or Windows-1252. Save it as UTF-8."
         ) from None
+
+
+def _check_beginning(data: bytes, source: str, kind: str) -> None:
+    for beginning, what in BEGINNINGS.items():
+        if data.startswith(beginning):
+            raise ConfigError(f"{source}: this is {what}, not a {kind} file.")

@@ -119,7 +119,7 @@ def _syntax_error(text: str, message: str, source: str) -> str:
     """The line, a mark under the place, what is wrong there, and what is probably meant."""
     place = re.search(r" \(at line (\d+), column (\d+)\)$", message)
     lines = text.split("\n")
-    if place is None:  # at the end of the document: something was never closed
+    if place is None or message.startswith("Unclosed"):  # perhaps noticed only much further down
         number, column = _unclosed(text)
     else:
         number, column = int(place[1]), int(place[2])

@@ -15,6 +15,7 @@ from pydantic.fields import FieldInfo
 
 from rig.base.errors import ConfigError
 
+EPSILON_0 = 8.8541878188e-12  # F/m
 PREFIXES = {"n": -9, "u": -6, "m": -3, "": 0, "k": 3, "M": 6}
 UNITS = {"m": "num ", "N": "m ", "Pa": " kM", "V": " k", "A": "num ", "s": "um ", "Hz": " k", "J": "um ", "g": "m k"}
 _UNIT = re.compile(r"_(?P<prefix>[numkM]?)(?P<unit>Pa|Hz|[mNVAsJg])(?:_per_(?P<below>[a-zA-Z0-9]+))?$")
@@ -63,7 +64,7 @@ def _unusual(table: BaseModel, name: str, place: str) -> Iterator[tuple[str, str
                 yield from _unusual(item, f"{name}{key}.", f"{where}, ")
             elif usual is not None and isinstance(item, int | float) and not _within(item, usual):
                 hint = slip(key, item, usual)
-                yield f"{name}{key}", f"{where} = {item:g}: usual are {usual[0]:g} to {usual[1]:g}. {hint}".rstrip()
+                yield f"{name}{key}", f"{where} = {item:.10g}: usual are {usual[0]:g} to {usual[1]:g}. {hint}".rstrip()
 
 
 def _within(value: float, usual: tuple[float, float]) -> bool:
@@ -77,9 +78,11 @@ def slip(key: str, value: float, usual: tuple[float, float]) -> str:
         for meant, ratio in reversed(readings) if value < 1 else readings:
             if value > 0 and usual[0] <= ratio <= usual[1]:
                 return f"If {meant} is meant, write {ratio:g}."
+    if key == "eps_r" and usual[0] <= value / EPSILON_0 <= usual[1]:
+        return f"If {value:g} F/m is meant, write {value / EPSILON_0:.3g}: it is relative to that of empty space."
     for unit, factor in _other_units(key):
         if usual[0] <= value * factor <= usual[1]:
-            return f"If {value:g} {unit} is meant, write {value * factor:.6g}."
+            return f"If {value:.10g} {unit} is meant, write {value * factor:.10g}."
     return ""
 
 

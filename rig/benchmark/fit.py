@@ -304,7 +304,7 @@ def _on_the_rig(minutes: Sequence[float], runs: int, progress: Progress) -> list
     with as_file(files("sim_fixtures")) as fixtures:
         path = fixtures / "scenes" / "cone-4mm.toml"
         scene, _ = load_scene(path)
-        certificates = certificates_of(scene, path.parent)
+        certificates = certificates_of(scene, path)
         for k, duration in enumerate(minutes):
             proposed = proposal.propose_protocol(path, 60.0 * duration, TRUTH, terms=1)
             for j, (name, design) in enumerate((("uniform sweep", proposed.sweep), ("planned", proposed.planned))):

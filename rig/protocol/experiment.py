@@ -56,26 +56,26 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
     if ports is not None:
         scene = scene.with_ports(ports)
     protocol, protocol_text = load_protocol(protocol_path)
-    certificates = certificates_of(scene, scene_path.parent)
+    certificates = certificates_of(scene, scene_path)
     actions = plan(protocol, scene)
     predictions = check_plan(actions, scene)
     _check_ranges(certificates, actions, predictions)
     return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions)
 
 
-def certificates_of(scene: Scene, folder: Path) -> dict[str, Certificate]:
-    """The certificates that the scene in ``folder`` names, by role; ConfigError when one cannot be used."""
+def certificates_of(scene: Scene, path: Path) -> dict[str, Certificate]:
+    """The certificates that the scene in the file ``path`` names, by role; ConfigError when one cannot be used."""
     found: dict[str, Certificate] = {}
     for role, table in scene.instruments.items():
         if table.certificate is None:
             continue
         try:
-            certificate = load_certificate(folder / table.certificate)
+            certificate = load_certificate(path.parent / table.certificate)
         except ConfigError as error:
-            raise ConfigError(f"{role}.certificate: {error}") from None
+            raise ConfigError(f"{path}: {role}.certificate: {error}") from None
         if certificate.role != role:
             raise ConfigError(
-                f"{role}.certificate = {table.certificate!r}: this certificate is for the role {certificate.role!r}."
+                f"{path}: {role}.certificate = {table.certificate!r}: this certificate is for the role {certificate.role!r}."
             )
         found[role] = certificate
     return found

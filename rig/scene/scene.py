@@ -114,7 +114,7 @@ class Scene(Table):
         broken = [*registered().broken, *registered_twins().broken]
         for role in ROLES if broken and isinstance(raw, dict) else ():
             table = raw.get(role)
-            if isinstance(table, dict) and table.get("driver") not in of_role(role):
+            if isinstance(table, dict) and str(table.get("driver")) not in of_role(role):
                 raise ValueError(f"{role}.driver = {table.get('driver')!r} is not known. {' '.join(broken)}")
         return raw
 
@@ -127,7 +127,7 @@ class Scene(Table):
         simulation = dict(raw["simulation"])
         for role in ROLES:
             table, truth = raw.get(role), simulation.get(role, {})
-            if isinstance(table, dict) and isinstance(truth, dict) and table.get("driver") in twins_of_role(role):
+            if isinstance(table, dict) and isinstance(truth, dict) and str(table.get("driver")) in twins_of_role(role):
                 simulation[role] = {"driver": table["driver"], **truth}
         return raw | {"simulation": simulation}
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from drivers.settings import NotNegative, Positive
@@ -13,17 +15,32 @@ from rig.base.law_tables import any_law, law_values
 from rig.base.table import Table
 from rig.base.unusual import slip_of
 
+USUAL_MODULUS_PA = (500.0, 2e7)  # of elastomers, from gels to hard rubber
+
+
+def _usual(modulus: float) -> bool:
+    return USUAL_MODULUS_PA[0] <= modulus <= USUAL_MODULUS_PA[1]
+
 
 class MaterialTable(Table):
     """What is believed of the film; the parameters of its law are further keys, made from `model.material.laws`."""
 
-    eps_r: float = Field(default=1.0, ge=1.0, description="Relative permittivity. Typical: 2 to 8; default 1.")
+    eps_r: float = Field(
+        default=1.0,
+        ge=1.0,
+        description="Relative permittivity. Typical: 2 to 8; default 1.",
+        json_schema_extra={"usual": [1, 50]},
+    )
     breakdown_V_per_um: Positive | None = Field(
         default=None,
         description="True field at which the film breaks down (V/um). Typical: 30 to 200. Absent: unknown.",
+        json_schema_extra={"usual": [1, 1000]},
     )
     max_stretch: float | None = Field(
-        default=None, gt=1.0, description="Largest stretch the film stands, pre-stretch included. Absent: unknown."
+        default=None,
+        gt=1.0,
+        description="Largest stretch the film stands, pre-stretch included. Absent: unknown.",
+        json_schema_extra={"usual": [1, 20]},
     )
     source: str = Field(default="", description="Where the numbers come from, for reports.")
 
@@ -31,6 +48,33 @@ class MaterialTable(Table):
     def _is_a_film(self) -> Self:
         self.material("here")  # whatever the model refuses
         return self
+
+    def unusual(self) -> Iterator[tuple[str, str]]:
+        """What is hardly meant of its law: see `rig.base.unusual`."""
+        law, values = law_values(self)
+        modulus = self.material("here").shear_modulus
+        keys = {p.name: p.key for p in law.parameters(*law.counts(1))}
+        if not _usual(modulus):
+            moduli = " and ".join(f"{key} = {getattr(self, key)}" for key in keys.values() if key.endswith("_Pa"))
+            units = {"kPa": 1e3, "MPa": 1e6, "mPa": 1e-3, "uPa": 1e-6}
+            meant = next((unit for unit, factor in units.items() if _usual(modulus * factor)), "")
+            hint = f" Are they in {meant}? They belong in Pa: 33e3 for 33 kPa." if meant else ""
+            yield (
+                "shear_modulus",
+                f"{moduli}: the shear modulus at small strain is then {modulus:.4g} Pa; usual are "
+                f"{USUAL_MODULUS_PA[0]:g} to {USUAL_MODULUS_PA[1]:g} Pa.{hint}",
+            )
+        if {"mu", "alpha"} <= values.keys():
+            yield from self._falling_terms(values)
+
+    @staticmethod
+    def _falling_terms(values: Mapping[str, float | list[float]]) -> Iterator[tuple[str, str]]:
+        """Terms that soften the film as it is stretched: possible beside others, but mostly a wrong sign."""
+        pairs = zip(np.atleast_1d(values["mu"]), np.atleast_1d(values["alpha"]), strict=True)
+        for number, (mu, alpha) in enumerate(pairs, 1):
+            if mu * alpha < 0:
+                text = f"mu_Pa {number} = {mu:g} with alpha {number} = {alpha:g}: both usually have the same sign."
+                yield "mu_Pa", text
 
     def material(self, name: str) -> Material:
         """The same in SI units."""

@@ -39,16 +39,19 @@ class Approach(Step):
         default=0.5,
         description="Speed of the stage on the way to contact (mm/s). Slower finds contact more exactly. "
         "Typical: 0.1 to 1.",
+        json_schema_extra={"usual": [0.0005, 200]},
     )
     threshold_mN: Positive = Field(
         default=5.0,
         description="Force at which the film counts as met (mN), averaged over 0.25 s: at least four times that "
         "average's noise. Typical: 5 to 10.",
+        json_schema_extra={"usual": [0.1, 1000]},
     )
     max_travel_mm: Positive = Field(
         default=20.0,
         description="How far to go from the scene's stage.approach_from_mm before the film counts as missing (mm). "
         "Typical: 5 to 20.",
+        json_schema_extra={"usual": [0.05, 300]},
     )
 
     def plan(self, state: State, scene: Scene) -> Iterator[Action]:

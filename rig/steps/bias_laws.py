@@ -52,7 +52,11 @@ class AntagonistLaw(BiasTable):
 
     kind: Literal["antagonist"] = Field(description=_KIND)
     spacer_mm: Positive = Field(description="Length of the spacer between both disks, L (mm).")
-    voltage_V: NotNegative = Field(default=0.0, description="Voltage on the second cone, V2 (V).")
+    voltage_V: NotNegative = Field(
+        default=0.0,
+        description="Voltage on the second cone, V2 (V).",
+        json_schema_extra={"usual": [5, 30000]},
+    )
 
     def bias(self, film: Specimen) -> Bias:
         return Antagonist(film, self.spacer_mm * 1e-3, self.voltage_V)

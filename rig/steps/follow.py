@@ -47,7 +47,10 @@ class Follow(Step):
     do: Literal["follow"] = Field(description="The kind of step.")
     bias: BiasLaw = Field(description="The bias that the stage plays: a table with kind and that kind's keys.")
     voltages_V: list[Positive] = Field(
-        min_length=1, max_length=50, description="Voltages in turn (V); between two of them the film rests at 0 V."
+        min_length=1,
+        max_length=50,
+        description="Voltages in turn (V); between two of them the film rests at 0 V.",
+        json_schema_extra={"usual": [5, 30000]},
     )
     rate_Hz: float = Field(
         default=40.0,
@@ -55,10 +58,15 @@ class Follow(Step):
         le=100.0,
         description="Cycles of the loop per second (Hz). Lower where the stage swings. Typical: 20 to 50.",
     )
-    speed_mm_per_s: Positive = Field(default=1.0, description="Largest speed of the disk (mm/s). Typical: 0.5 to 2.")
+    speed_mm_per_s: Positive = Field(
+        default=1.0,
+        description="Largest speed of the disk (mm/s). Typical: 0.5 to 2.",
+        json_schema_extra={"usual": [0.0005, 200]},
+    )
     settle_s: Positive = Field(
         default=1.0,
         description="How long force and law must agree for a rest (s). Typical: 1 to 5.",
+        json_schema_extra={"usual": [0.01, 10000]},
     )
     average_s: Positive = Field(default=5.0, description="How long to measure each rest (s). Typical: 2 to 10.")
     patience_s: Positive = Field(default=60.0, description="After this long without a rest the run ends (s).")

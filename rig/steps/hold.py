@@ -21,7 +21,10 @@ class Hold(Step):
     joins: ClassVar[bool] = True
 
     do: Literal["hold"] = Field(description="The kind of step.")
-    duration_s: Positive = Field(description="How long (s). In contact with the film what is measured is data.")
+    duration_s: Positive = Field(
+        description="How long (s). In contact with the film what is measured is data.",
+        json_schema_extra={"usual": [0.01, 100000]},
+    )
 
     def plan(self, state: State, scene: Scene) -> Iterator[Action]:
         yield Holding(

@@ -26,7 +26,8 @@ class Meter(Averaged):
 
     do: Literal["meter"] = Field(description="The kind of step.")
     voltages_V: Standards = Field(
-        description="Voltages to set (V), 0 among them. Typical: five, evenly spread up to the highest that is used."
+        description="Voltages to set (V), 0 among them. Typical: five, evenly spread up to the highest that is used.",
+        json_schema_extra={"usual": [5, 30000]},
     )
     meter_relative_uncertainty: NotNegative = Field(
         default=5e-4, description="Standard uncertainty of the reference meter, as a part of its reading."

@@ -22,7 +22,8 @@ class Precondition(Step):
     do: Literal["precondition"] = Field(description="The kind of step.")
     displacement_mm: Positive = Field(
         description="Displacement of the disk out of the film's plane to which to load (mm): at least the largest that "
-        "is measured afterwards."
+        "is measured afterwards.",
+        json_schema_extra={"usual": [0.02, 200]},
     )
     speed_mm_per_s: Positive = Field(description="Speed of the disk, both ways (mm/s). Typical: 0.5 to 2.")
     cycles: Annotated[int, Field(ge=1, le=1000)] = Field(default=3, description="Times up and back. Typical: 3 to 5.")

@@ -26,7 +26,10 @@ class Press(Averaged):
     calibrates: ClassVar[str] = "compliance"
 
     do: Literal["press"] = Field(description="The kind of step.")
-    force_N: Positive = Field(description="Force up to which to press (N); within limits.force_N.")
+    force_N: Positive = Field(
+        description="Force up to which to press (N); within limits.force_N.",
+        json_schema_extra={"usual": [0.001, 200]},
+    )
     step_um: Positive = Field(
         default=0.5,
         description="How far the stage goes from standstill to standstill (um). Start small: a step must not cost "

@@ -21,7 +21,8 @@ class Ramp(Step):
 
     do: Literal["ramp"] = Field(description="The kind of step.")
     displacement_mm: NotNegative = Field(
-        description="Displacement of the disk out of the film's plane at the end (mm), from where it met the flat film."
+        description="Displacement of the disk at the end (mm), from where it met the flat film.",
+        json_schema_extra={"usual": [0.02, 200]},
     )
     speed_mm_per_s: Positive = Field(description="Speed of the disk (mm/s). Typical: 0.1 to 2.")
 

@@ -22,7 +22,11 @@ class Return(Step):
     on_resume: ClassVar[OnResume] = OnResume.ENDS_CONTACT
 
     do: Literal["return"] = Field(description="The kind of step.")
-    speed_mm_per_s: Positive = Field(default=2.0, description="Speed of the stage (mm/s). Typical: 1 to 5.")
+    speed_mm_per_s: Positive = Field(
+        default=2.0,
+        description="Speed of the stage (mm/s). Typical: 1 to 5.",
+        json_schema_extra={"usual": [0.0005, 200]},
+    )
     clearance_mm: NotNegative = Field(
         default=2.0, description="How far behind the flat film the pusher stands at the end (mm). Typical: 1 to 5."
     )

@@ -31,7 +31,11 @@ class Averaged(Step):
     """What every series of standstills has."""
 
     cycles: Cycles = Field(default=2, description="Times through all standards, up and down. Typical: 2 to 5.")
-    settle_s: NotNegative = Field(default=2.0, description="Wait before each reading (s). Typical: 1 to 5.")
+    settle_s: NotNegative = Field(
+        default=2.0,
+        description="Wait before each reading (s). Typical: 1 to 5.",
+        json_schema_extra={"usual": [0.01, 10000]},
+    )
     average_s: Positive = Field(default=2.0, description="How long to read at each standstill (s). Typical: 2 to 10.")
 
 

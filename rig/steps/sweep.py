@@ -20,21 +20,32 @@ class Sweep(Step):
     records: ClassVar[bool] = True
 
     do: Literal["sweep"] = Field(description="The kind of step.")
-    displacement_mm: Positive = Field(description="Largest displacement of the disk out of the film's plane (mm).")
+    displacement_mm: Positive = Field(
+        description="Largest displacement of the disk out of the film's plane (mm).",
+        json_schema_extra={"usual": [0.02, 200]},
+    )
     from_mm: NotNegative = Field(
         default=0.0, description="Displacement at which each cycle begins and ends (mm); smaller than displacement_mm."
     )
-    speed_mm_per_s: Positive = Field(description="Speed of the disk, both ways (mm/s). Typical: 0.1 to 2.")
+    speed_mm_per_s: Positive = Field(
+        description="Speed of the disk, both ways (mm/s). Typical: 0.1 to 2.",
+        json_schema_extra={"usual": [0.0005, 200]},
+    )
     voltages_V: list[NotNegative] = Field(
         default=[0.0],
         min_length=1,
         max_length=100,
         description="Voltages in turn (V). One that comes again goes on counting its cycles.",
+        json_schema_extra={"usual": [5, 30000]},
     )
     cycles: Annotated[int, Field(ge=1, le=1000)] = Field(
         default=1, description="How often at each voltage, up and back. Typical: 1 to 3."
     )
-    settle_s: NotNegative = Field(default=1.0, description="Wait after each measured voltage has arrived (s).")
+    settle_s: NotNegative = Field(
+        default=1.0,
+        description="Wait after each measured voltage has arrived (s).",
+        json_schema_extra={"usual": [0.01, 10000]},
+    )
 
     @property
     def highest_voltage(self) -> float:

@@ -22,7 +22,8 @@ class Visit(Averaged):
 
     do: Literal["visit"] = Field(description="The kind of step.")
     positions_mm: Annotated[list[NotNegative], Field(min_length=1, max_length=50)] = Field(
-        description="Positions of the stage, on its own scale (mm). Typical: seven over the range that will be used."
+        description="Positions of the stage, on its own scale (mm). Typical: seven over the range that will be used.",
+        json_schema_extra={"usual": [0.01, 1000]},
     )
     speed_mm_per_s: Positive = Field(default=5.0, description="Speed of the stage between them (mm/s).")
     accuracy_um: NotNegative = Field(

@@ -20,7 +20,8 @@ class Voltage(Step):
     do: Literal["voltage"] = Field(description="The kind of step.")
     voltage_V: NotNegative = Field(
         description="Voltage to which to ramp (V), at the scene's hv.ramp_V_per_s. What it means for the film's field "
-        "depends on the stretch there; `dea-rig check` shows it."
+        "depends on the stretch there; `dea-rig check` shows it.",
+        json_schema_extra={"usual": [5, 30000]},
     )
     settle_s: NotNegative = Field(
         default=1.0,

@@ -27,6 +27,7 @@ class Zero(Step):
         default=2.0,
         description="How long to average the readings (s). The zero's uncertainty falls with its square root. "
         "Typical: 2 to 5.",
+        json_schema_extra={"usual": [0.01, 100000]},
     )
 
     def plan(self, state: State, scene: Scene) -> Iterator[Action]:
