@@ -75,7 +75,7 @@ def certificates_of(scene: Scene, path: Path) -> dict[str, Certificate]:
             raise ConfigError(f"{path}: {role}.certificate: {error}") from None
         if certificate.role != role:
             raise ConfigError(
-                f"{path}: {role}.certificate = {table.certificate!r}: this certificate is for the role {certificate.role!r}."
+                f"{path}: {role}.certificate = {table.certificate!r}: this one is for the role {certificate.role!r}."
             )
         found[role] = certificate
     return found

@@ -112,7 +112,7 @@ SCENES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ("material", "parker-cao2018"),
     ),
     "no certificate there": ("cal/hv.toml", "cal/hv9.toml", ("hv.certificate", "cal/hv9.toml", "no such certificate")),
-    "certificate of another role": ("cal/hv.toml", "cal/force.toml", ("hv", "role 'force'")),
+    "certificate of another role": ("cal/hv.toml", "cal/force.toml", ("hv", "for the role 'force'")),
     "a scene as certificate": ("cal/hv.toml", "s.toml", ("hv.certificate", "this is a scene file")),
     "colours in a title": ("title = ", 'title = "\\u001b[31mred" # ', ("title", "control character U+001B")),
     "a title for the rich": ("title = ", 'title = "[/red] x" # ', ()),
