@@ -23,6 +23,7 @@ from rig.log.contents import IN_MEMORY
 from rig.log.dataset import CurveErrors, Run, SpecimenErrors, load_run
 from rig.scene.scene import Scene
 from rig.scene.specimen import SpecimenTable
+from rig.steps import registry
 
 # Of a rig that nobody pressed on (m/N): load cells for a newton give way by some 0.3 mm at full scale.
 UNKNOWN_COMPLIANCE = 3e-4
@@ -84,7 +85,8 @@ def identify_logs(
     try:
         for run, scene in zip(runs, scenes, strict=True):
             certificates = run.certificates
-            found = run.curves(scene.specimen.specimen(), **_errors(run, scene, certificates))
+            joining = registry.joining({phase.kind for phase in run.phases})
+            found = run.curves(scene.specimen.specimen(), joining, **_errors(run, scene, certificates))
             corrected = [_without_compliance(curve, run, certificates) for curve in found]
             inside = [_in_calibrated_range(_at_its_voltage(curve), certificates) for curve in corrected]
             curves += [_with_drift(curve, certificates) for curve in inside]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 
 # Values are interpolated between neighbouring samples only; a hole longer than this many sample periods stays one.
 LONGEST_PERIODS = 3.0
+
+JOINING = ("ramp", "hold")
 
 _TOPICS = ("/force/sample", "/displacement/sample", "/stage/sample", "/hv/sample")
 
@@ -143,15 +145,19 @@ class Run:
         found = [reference for reference in self.references if reference.name == name and reference.t <= t]
         return found[-1] if found else None
 
-    def curves(self, specimen: Specimen, **errors: Unpack[CurveErrors]) -> list[Curve]:
+    def curves(
+        self, specimen: Specimen, joining: Collection[str] = JOINING, **errors: Unpack[CurveErrors]
+    ) -> list[Curve]:
         """The recorded parts as curves ready for identification: one per step, voltage and cycle.
 
-        Ramps and holds that follow each other at one voltage are one curve.
+        Ramps and holds, and whatever else is ``joining``, that follow each other at one voltage are one curve.
 
         Parameters
         ----------
         specimen : model.specimen.Specimen
             As the scene describes it.
+        joining : collection of str
+            Kinds of phases that are one curve with those before and after; `rig.steps.registry.joining` knows them.
         **errors : float
             Uncertainties for every curve. Those of the force zero and of the displacement zero come from the log's
             references unless they are given.
@@ -161,20 +167,22 @@ class Run:
         parts: dict[tuple[int, float, int], list[int]] = {}
         start: Phase | None = None  # of the ramps and holds that are going on
         for index, phase in enumerate(self.phases):
-            loose = phase.record and phase.kind in ("ramp", "hold")
+            loose = phase.record and phase.kind in joining
             if not loose or start is None or start.voltage != phase.voltage:
                 start = phase if loose else None
             if phase.record:
                 step = start.step if start is not None else phase.step
                 parts.setdefault((step, phase.voltage, phase.cycle), []).append(index)
         curves = []
+        directions = np.array([phase.direction for phase in self.phases], dtype=np.int8)
+        first = np.searchsorted(self.phase, np.arange(len(self.phases) + 1))  # rows are in the order of the phases
         for (step, voltage, cycle), indexes in parts.items():
-            rows = np.flatnonzero(np.isin(self.phase, indexes))
+            rows = np.concatenate([np.arange(first[index], first[index + 1]) for index in indexes])
             if rows.size:
                 label = f"{specimen.name or self.log.path.stem}, {voltage:g} V, step {step}" + (
                     f", cycle {cycle}" if cycle else ""
                 )
-                direction = np.array([phase.direction for phase in self.phases], dtype=np.int8)[self.phase[rows]]
+                direction = directions[self.phase[rows]]
                 curves.append(
                     Curve(
                         label=label,

@@ -10,7 +10,8 @@ It is loaded when a protocol names it, and not before.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import get_args
@@ -81,6 +82,19 @@ def find(name: str) -> type[Step] | None:
         Another package's step cannot be loaded, or is none; names the package.
     """
     return OWN.get(name) or _load(name)
+
+
+def joining(kinds: Iterable[str]) -> set[str]:
+    """Those of ``kinds`` whose data, where they follow each other at one voltage, are one curve.
+
+    A step of another package that cannot be loaded counts as none of them.
+    """
+    found = set()
+    for name in kinds:
+        with suppress(ConfigError):
+            if (step := find(name)) is not None and step.joins:
+                found.add(name)
+    return found
 
 
 @cache

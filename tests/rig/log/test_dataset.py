@@ -1,13 +1,15 @@
 import math
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import pytest
 
 from model.material.materials import NAMED
 from model.specimen import Specimen
-from rig.log.dataset import interpolate, load_run
+from rig.log.dataset import Phase, interpolate, load_run
 from rig.log.errors import LogError
 from rig.log.writer import LogWriter
 
@@ -182,3 +184,34 @@ def test_interpolate_edges():
     assert interpolate(np.array([0.5]), np.array([2.0, 0.0, 1.0, 1.0]), np.array([2.0, 0.0, 1.0, 1.0])).tolist() == [
         0.5
     ]
+
+
+def test_many_short_curves_take_time_in_proportion(tmp_path):
+    """Twice the samples in twice the curves take twice as long, give or take, not four times."""
+    write_run(tmp_path / "a.mcap")
+    run = load_run(tmp_path / "a.mcap")
+
+    def seconds(many):
+        n = 20 * many
+        t = np.arange(n) * 1e-2
+        phases = [Phase(t[20 * k], k + 1, "sweep", "", 1, 1, 0.0, True) for k in range(many)]
+        column = np.zeros(n)
+        big = replace(
+            run,
+            t=t,
+            force=column,
+            h=column,
+            voltage=column,
+            flagged=column > 0,
+            phase=np.arange(n) // 20,
+            phases=phases,
+        )
+        began = process_time()
+        curves = big.curves(SPECIMEN, force_noise=1e-3)
+        took = process_time() - began
+        assert len(curves) == many and all(curve.h.size == 20 for curve in curves)
+        return took
+
+    seconds(100)
+    short, long = (min(seconds(many) for _ in range(3)) for many in (500, 2000))
+    assert long < 8 * short  # measured 4; 16 where every curve looks at every sample
