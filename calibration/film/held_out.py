@@ -62,7 +62,7 @@ def _predicted(
 def _fitted(
     curves: Sequence[Curve], near: Material, wrinkling: Wrinkling, *, only_nuisances: bool
 ) -> tuple[Problem, Material, np.ndarray]:
-    problem = Problem(curves, select(curves, near, wrinkling), len(near.mu), near, wrinkling=wrinkling)
+    problem = Problem(curves, select(curves, near, wrinkling), near.terms, near, wrinkling=wrinkling)
     start = problem.vector(near)
     free = np.ones(start.size, dtype=np.bool_)
     free[: problem.film_parameters] = not only_nuisances

@@ -25,7 +25,7 @@ def expected(curves: Sequence[Curve], material: Material) -> Statement:
 
     Only the displacements, voltages and uncertainties of ``curves`` matter, not their forces: this is for planning.
     """
-    problem = Problem(curves, select(curves, material), len(material.mu), material, trust_noise=True)
+    problem = Problem(curves, select(curves, material), material.terms, material, trust_noise=True)
     x = problem.vector(material)
     return state(problem, x, np.zeros(x.size, dtype=np.bool_), held=())
 
@@ -38,13 +38,13 @@ def expected_uncertainties(curves: Sequence[Curve], material: Material) -> dict[
 def advice(
     curves: Sequence[Curve], material: Material, quantities: Mapping[str, Quantity], reach: float = math.inf
 ) -> list[str]:
-    """Which of a few further measurements would shrink the largest uncertainty of an Ogden term, and to what.
+    """Which of a few further measurements would shrink the largest uncertainty of a law's parameter, and to what.
 
     Every candidate is a set of curves added to the present ones, at 0 V and with the present noise, judged by the
     Fisher information at ``material``. ``reach`` (m) is as far as the rig may go. Empty when all terms are at least
     weakly identified.
     """
-    raw = {name: q.relative for name, q in quantities.items() if name.startswith(("mu", "alpha"))}
+    raw = {name: q.relative for name, q in quantities.items() if name in material.values}
     if max(raw.values()) <= WEAKLY_IDENTIFIED:
         return []
     now = expected_uncertainties(curves, material)
@@ -73,7 +73,7 @@ def advice(
             enough = "" if then <= WEAKLY_IDENTIFIED else ", which is still not enough"
             words.append(f"{what} would bring {worst} from {_percent(now[worst].relative)} to {_percent(then)}{enough}")
     words.sort(key=lambda text: "not enough" in text)
-    if len(material.mu) > 1:
+    if material.terms > 1:
         words.append("or fit fewer terms: the stiffness at the stretches reached does not need them")
     return words
 

@@ -26,6 +26,7 @@ from calibration.film.curve import Curve
 from calibration.film.held_out import held_out
 from calibration.film.minima import (
     confirm,
+    of_law,
     other_minima,
     polish,
     representative,
@@ -40,6 +41,7 @@ from calibration.film.reduction import Selection, select
 from calibration.film.result import Identification
 from calibration.film.summary import summarise
 from calibration.film.suspects.registry import fittable
+from model.material.law import Law
 from model.material.materials import Material
 from model.membrane.solve import Wrinkling
 
@@ -56,6 +58,7 @@ INTERPOLATION = 0.1  # largest estimated error of interpolation, in standard dev
 def identify(
     curves: Sequence[Curve],
     *,
+    law: type[Law] | None = None,
     terms: int = 2,
     starts: int = 6,
     seed: int = 0,
@@ -69,14 +72,16 @@ def identify(
     fixed_stretch: tuple[float, float] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Identification:
-    """Fit an Ogden film to force-displacement curves.
+    """Fit a film to force-displacement curves.
 
     Parameters
     ----------
     curves : sequence of Curve
         All curves of all runs and specimens of one film material.
+    law : type[Law], optional
+        The law to fit; that of the specimens' material when not given.
     terms : int
-        Number of Ogden terms.
+        Number of terms, where the law is a series (Ogden).
     starts : int
         Starting points; the first is the material of the specimens, the others are drawn with ``seed``.
     negative_exponents : bool
@@ -85,7 +90,8 @@ def identify(
         Also find the 95 % intervals of ``G``, ``stiffness`` and ``eps_r`` by profile likelihood. It takes a few times
         as long, and widens the uncertainties where the problem is too far from linear for its curvature to tell.
     fixed : mapping of str to float, optional
-        ``alpha1``... and ``eps_r`` that are known and not to be fitted, e.g. ``{"eps_r": 1.7}``.
+        Shape parameters of the law (``alpha1``..., ``Jm``) and ``eps_r`` that are known and not to be fitted, e.g.
+        ``{"eps_r": 1.7}``.
     wrinkling : {"plain", "tension_field"}
         What becomes of samples at which the film is wrinkled: left out, or described by the tension field. They are
         counted either way.
@@ -108,25 +114,26 @@ def identify(
         When nothing can be identified from these curves.
     """
     held = dict(fixed or {})
-    allowed = [*(f"alpha{n + 1}" for n in range(terms)), "eps_r"]
+    if not curves:
+        raise IdentificationError("there are no curves")
+    guess = curves[0].specimen.material
+    law = law or guess.law
+    moduli, shapes = law.counts(max(1, terms))
+    allowed = [*law.names(moduli, shapes)[moduli:], "eps_r"]
     unknown = [name for name in held if name not in allowed]
     if unknown:
         raise IdentificationError(f"cannot fix {', '.join(unknown)}; what can be fixed is {', '.join(allowed)}")
     if terms < 1 or starts < 1:
         raise IdentificationError("terms and starts must be at least 1")
-    if not curves:
-        raise IdentificationError("there are no curves")
-
     choice = fittable()
     strange = [key for key in along if key not in choice]
     if strange:
         raise IdentificationError(f"cannot fit {', '.join(strange)} along; what can be is {', '.join(sorted(choice))}")
     asked = [choice[key] for key in dict.fromkeys(along)]
 
-    guess = curves[0].specimen.material
     if "eps_r" in held:
         guess = replace(guess, eps_r=held["eps_r"])
-    (material,) = scaled([guess], curves)
+    (material,) = scaled([of_law(guess, law, terms, seed)], curves)
     selections = select(curves, material, wrinkling)
     notes: list[str] = []
     nodes = NODES
@@ -136,7 +143,7 @@ def identify(
                 curves, selections, terms, material, tolerance=SEARCH_TOLERANCE, wrinkling=wrinkling, along=asked
             )
             points = starting_materials(material, terms, starts, seed, held, negative_exponents)
-            points += [spread(one, terms) for one in near]
+            points += [spread(one, terms) for one in near if law.series]
             fits = search(coarse, scaled(points, curves), held)
             best = representative(fits)
             material = coarse.film(best.x)
@@ -165,6 +172,7 @@ def identify(
     record = {
         "data": dict(provenance or {}),
         "settings": {
+            "law": law.name,
             "terms": terms,
             "starts": starts,
             "seed": seed,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings as python_warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from calibration.film.curve import Curve
 from calibration.film.problem import IdentificationError, Problem
 from calibration.film.search import minimise_many
+from model.material.law import Law
 from model.material.materials import Material
 from model.membrane.solve import solve_many
 
@@ -56,7 +56,7 @@ def scaled(materials: Sequence[Material], curves: Sequence[Curve]) -> list[Mater
 
 
 def spread(material: Material, terms: int) -> Material:
-    """The same film with more terms: its last one, cut in pieces with exponents around its own."""
+    """The same film with more Ogden terms: its last one, cut in pieces with exponents around its own."""
     mu, alpha = list(material.mu), list(material.alpha)
     pieces = terms - len(mu) + 1
     share = mu.pop() * alpha[-1] / pieces
@@ -69,23 +69,35 @@ def spread(material: Material, terms: int) -> Material:
 def starting_materials(
     guess: Material, terms: int, count: int, seed: int, held: Mapping[str, float], negative: bool
 ) -> list[Material]:
-    """The guess, where it has as many terms, and random sets with the same modulus."""
-    random = np.random.default_rng(seed)
+    """The guess, where it has as many terms, and random sets of its law with the same modulus."""
+    random, law = np.random.default_rng(seed), guess.law
     sets: list[tuple[Array, Array]] = []
-    mu, alpha = np.array(guess.mu), np.array(guess.alpha)
-    if len(mu) == terms and (mu * alpha > 0.0).all():
-        sets.append((mu * alpha / 2.0, alpha))
+    moduli, shapes = law.counts(terms)
+    alpha = np.array(guess.alpha)
+    share = np.array(guess.mu) * law.weights(alpha)[0]
+    if len(share) == moduli and (not law.series or (share > 0.0).all()):
+        sets.append((share, alpha))
     while len(sets) < count:
-        alpha = np.sort(np.exp(random.uniform(math.log(1.2), math.log(12.0), terms)))
-        if negative and terms > 1 and len(sets) % 3 == 2:
+        share, alpha = law.draw(random, terms)
+        if negative and law.series and terms > 1 and len(sets) % 3 == 2:
             alpha[0] *= -1.0
-        sets.append((guess.shear_modulus * random.dirichlet(np.ones(terms)), alpha))
+        sets.append((guess.shear_modulus * share, alpha))
+    names = law.names(moduli, shapes)[moduli:]
     materials = []
     for share, alpha in sets[:count]:
-        alpha = np.array([held.get(f"alpha{n + 1}", value) for n, value in enumerate(alpha)])
-        mu = 2.0 * share / alpha
-        materials.append(Material(name="start", mu=tuple(mu), alpha=tuple(alpha), eps_r=guess.eps_r))
+        alpha = np.array([held.get(name, value) for name, value in zip(names, alpha, strict=True)])
+        mu = share / law.weights(alpha)[0]
+        materials.append(Material(name="start", mu=tuple(mu), alpha=tuple(alpha), eps_r=guess.eps_r, law=law))
     return materials
+
+
+def of_law(material: Material, law: type[Law], terms: int, seed: int) -> Material:
+    """A film of another law with the same modulus and permittivity; itself where it is of that law already."""
+    if material.law is law:
+        return material
+    share, alpha = law.draw(np.random.default_rng(seed), terms)
+    mu = material.shear_modulus * share / law.weights(alpha)[0]
+    return replace(material, mu=tuple(mu), alpha=tuple(alpha), law=law)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,17 +128,17 @@ class Fit:
 
 def search(problem: Problem, materials: Sequence[Material], held: Mapping[str, float]) -> list[Fit]:
     """Minima from all starting materials, best first."""
-    n = problem.terms
+    n = problem.film_numbers
     varied = np.array([name not in held for name in problem.names])
     points = np.array([problem.vector(material) for material in materials])
     low, high = (np.array(side) for side in zip(*(problem.bounds(x) for x in points), strict=True))
     points = np.where(varied, np.clip(points, low, high), points)
     if problem.electric and "eps_r" not in held:
         for _ in range(8):
-            lost = ~problem.evaluate(points, slopes=False).answered & (points[:, 2 * n] > 1.0)
+            lost = ~problem.evaluate(points, slopes=False).answered & (points[:, n] > 1.0)
             if not lost.any():
                 break
-            points[lost, 2 * n] *= 0.5  # a film this soft cannot hold the voltage with that permittivity
+            points[lost, n] *= 0.5  # a film this soft cannot hold the voltage with that permittivity
     found = minimise_many(problem, points, (low, high), varied)
     fits = [
         _fit(problem, one.x, one.cost, one.converged, (low[k], high[k]), varied, held)
@@ -147,12 +159,12 @@ def _fit(
     varied: NDArray[np.bool_],
     held: Mapping[str, float],
 ) -> Fit:
-    """A minimum with its terms sorted by exponent."""
-    n = problem.terms
+    """A minimum, the terms of a series sorted by exponent."""
+    n = problem.moduli
     low, high = bounds
     span = high - low
     at_bound = varied & (np.minimum(x - low, high - x) < AT_BOUND * span) & np.isfinite(span)
-    if not any(name.startswith("alpha") for name in held):
+    if problem.law.series and not set(problem.names[n : problem.film_numbers]) & set(held):
         order = np.argsort(x[n : 2 * n])
         order = np.concatenate((order, n + order, np.arange(2 * n, x.size)))
         x, at_bound = x[order], at_bound[order]
@@ -217,9 +229,9 @@ def other_minima(fits: Sequence[Fit]) -> list[str]:
     for fit in fits[1:]:
         if fit.cost - best.cost >= SAME_MINIMUM:
             break
-        n = 2 * fit.problem.terms
+        n = fit.problem.film_numbers
         if (np.abs(fit.x[:n] - best.x[:n]) > 0.2 * np.abs(best.x[:n])).any():
             film = fit.problem.film(fit.x)
-            pairs = ", ".join(f"mu = {m:.4g} Pa with alpha = {a:.3g}" for m, a in zip(film.mu, film.alpha, strict=True))
-            return [f"other Ogden parameters fit these data equally well, for instance {pairs}"]
+            told = ", ".join(f"{name} = {value:.4g}" for name, value in film.values.items())
+            return [f"other parameters fit these data equally well, for instance {told} (moduli in Pa)"]
     return []

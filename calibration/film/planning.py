@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from calibration.film.curve import Curve
 from calibration.film.propagation import secant
 from model.material.materials import Material
+from model.material.ogden import Ogden
 from model.membrane.solve import solve_many
 from model.specimen import Specimen
 
@@ -54,10 +55,10 @@ class Places:
         solved = solve_many(specimen, h, voltage, sensitivities=True)
         slopes = solved.dforce
         assert slopes is not None
-        mu, alpha = np.array(material.mu), np.array(material.alpha)
-        n, charged = mu.size, bool((voltage != 0.0).any())
+        mu = np.array(material.mu)
+        charged = bool((voltage != 0.0).any())
         columns = [slopes["mu"] * mu, slopes["alpha"]]
-        prior = [WIDE_PRIOR] * (2 * n)
+        prior = [WIDE_PRIOR] * (mu.size + len(material.alpha))
         if charged:
             columns.append(slopes["eps_r"][:, None] * material.eps_r)
             prior.append(WIDE_PRIOR)
@@ -71,11 +72,12 @@ class Places:
                 prior.append(size)
         sigma = np.hypot(errors.force_noise, slopes["h"] * errors.displacement_noise)
         rows = np.concatenate(columns, axis=1) * (math.sqrt(rate) / sigma)[:, None]
-        value, by_mu, by_alpha = secant(mu, alpha, np.array([stretch[0]]), stretch[1])
+        value, by_mu, by_alpha = secant(material, np.array([stretch[0]]), stretch[1])
         self.wanted = np.zeros((2 if charged else 1, rows.shape[1]))
-        self.wanted[0, :n], self.wanted[0, n : 2 * n] = by_mu[0] * mu / value[0], by_alpha[0] / value[0]
+        of_law = np.concatenate((by_mu[0] * mu, by_alpha[0])) / value[0]
+        self.wanted[0, : of_law.size] = of_law
         if charged:
-            self.wanted[1, 2 * n] = 1.0
+            self.wanted[1, of_law.size] = 1.0
         self.prior = np.diag(np.array(prior) ** -2.0)
         self.weight = np.ones(len(self.wanted))  # of the logarithms of the variances of what is wanted
         usable = np.isfinite(rows).all(axis=1)
@@ -100,19 +102,20 @@ class Places:
 
 
 def one_term(material: Material, stretches: tuple[float, float], hoop: float) -> Material:
-    """The one-term film with the same meridional stress at two meridional stretches."""
-    wanted, *_ = secant(np.array(material.mu), np.array(material.alpha), np.array(stretches), hoop)
+    """The film of one Ogden term with the same meridional stress at two meridional stretches."""
+    wanted, *_ = secant(material, np.array(stretches), hoop)
 
     def stiffening(alpha: float) -> float:
-        found, *_ = secant(np.ones(1), np.array([alpha]), np.array(stretches), hoop)
+        found, *_ = secant(replace(material, mu=(1.0,), alpha=(alpha,), law=Ogden), np.array(stretches), hoop)
         return float(found[1] / found[0])
 
     low, high = 0.5, 30.0
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if stiffening(middle) < wanted[1] / wanted[0] else (low, middle)
-    unit, *_ = secant(np.ones(1), np.array([low]), np.array(stretches), hoop)
-    return replace(material, name=f"{material.name}, one term", mu=(float(wanted[0] / unit[0]),), alpha=(low,))
+    unit, *_ = secant(replace(material, mu=(1.0,), alpha=(low,), law=Ogden), np.array(stretches), hoop)
+    modulus = float(wanted[0] / unit[0])
+    return replace(material, name=f"{material.name}, one term", mu=(modulus,), alpha=(low,), law=Ogden)
 
 
 def propose(places: Places, time: float, overhead: Overhead) -> list[Dwell]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calibration.film.curve import Curve
 from calibration.film.problem import IdentificationError, Problem
-from calibration.film.propagation import secant_modulus
+from calibration.film.propagation import secant_modulus, sorted_terms
 from calibration.film.reduction import select
 from calibration.film.result import Identification, Posterior, Sampled
 from calibration.film.suspects.registry import fittable
@@ -129,12 +129,8 @@ def _around(jacobian: Array, best: Array, low: Array, high: Array, walkers: int,
 
 def _quantities(problem: Problem, points: Array, found: Identification) -> dict[str, Sampled]:
     films = [problem.film(x) for x in points]
-    # Terms are told apart by their exponents, as in the result of the fit.
-    sorted_terms = [sorted(zip(film.alpha, film.mu, strict=True)) for film in films]
-    values: dict[str, list[float]] = {}
-    for n in range(found.terms):
-        values[f"mu{n + 1}"] = [terms[n][1] for terms in sorted_terms]
-        values[f"alpha{n + 1}"] = [terms[n][0] for terms in sorted_terms]
+    named = [sorted_terms(film).values for film in films]
+    values = {name: [one[name] for one in named] for name in named[0]}
     values["G"] = [film.shear_modulus for film in films]
     values["stiffness"] = [secant_modulus(film, *found.stretch) for film in films]
     if "eps_r" in found.quantities:

@@ -32,8 +32,6 @@ Array = NDArray[np.float64]
 NODES = 8  # of every part of a curve, to begin with
 COMPLIANCE_ROUNDS = 3  # rounds after which force and giving way agree; each is off by a few per cent of the one before
 TOLERANCE = 1e-7  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
-SHARE_BOUNDS = (1e-6, 100.0)  # positive: so is every mu_n alpha_n, which makes the film stable at any stretch
-EXPONENT_BOUNDS = (0.2, 30.0)  # of |alpha|
 PERMITTIVITY_BOUNDS = (0.5, 200.0)
 # Dimensions of a specimen, and the field of a curve with their relative standard uncertainty.
 DIMENSIONS = {
@@ -86,11 +84,13 @@ class Evaluation:
 class Problem:
     """Residuals and Jacobian of one pass, with the choice of samples and their weights fixed.
 
-    The parameter vector ``x`` is ``[g_1..g_N, alpha_1..alpha_N, (eps_r), nuisances...]``; nuisances are in units of
-    their priors. Each part of a curve is a row of ``nodes``, and ``active`` names the curve of each row. The rig gives
-    way by the force of the material ``at``, where its ``compliance`` (m/N, beyond that believed) holds the disk.
-    ``solved`` counts the membrane states that were computed: rows times nodes for an evaluation, whatever the number
-    of samples.
+    The parameter vector ``x`` is ``[shares, shape parameters, (eps_r), nuisances...]``. The shares are the moduli of
+    the law of the material ``at``, made of order one (`model.material.law.Law.weights`): of Ogden terms
+    ``g_n = mu_n alpha_n / (2 G_0) > 0``, which keeps the film stable at any stretch. ``terms`` counts for a series
+    only. Nuisances are in units of their priors. Each part of a curve is a row of ``nodes``, and ``active`` names the
+    curve of each row. The rig gives way by the force of the material ``at``, where its ``compliance`` (m/N, beyond
+    that believed) holds the disk. ``solved`` counts the membrane states that were computed: rows times nodes for an
+    evaluation, whatever the number of samples.
     """
 
     def __init__(
@@ -109,7 +109,10 @@ class Problem:
     ) -> None:
         self.curves = curves
         self.selections = selections
-        self.terms = terms
+        self.law = at.law
+        self.moduli, shapes = at.law.counts(terms)
+        self.film_numbers = self.moduli + shapes  # where eps_r stands in x
+        self.parameters = at.law.parameters(self.moduli, shapes)
         self.material = at
         self.scale = at.shear_modulus
         self.tolerance = tolerance
@@ -127,7 +130,8 @@ class Problem:
         self.nodes = np.array([chebyshev_nodes(part.low, part.high, nodes) for _, part in self.pieces])
         self.voltage = np.array([reference_voltage(curves[i], part.used) for i, part in self.pieces])
         self.nuisances = self._nuisances()
-        self.names = [f"g{n + 1}" for n in range(terms)] + [f"alpha{n + 1}" for n in range(terms)]
+        self.names = [f"g{n + 1}" for n in range(self.moduli)]
+        self.names += at.law.names(self.moduli, shapes)[self.moduli :]
         self.names += ["eps_r"] if self.electric else []
         self.film_parameters = len(self.names)
         self.names += [f"{nuisance.kind}_{k}" for k, nuisance in enumerate(self.nuisances)]
@@ -230,35 +234,42 @@ class Problem:
 
     def film(self, x: Array) -> Material:
         """The material of a parameter vector."""
-        n = self.terms
-        mu = 2.0 * self.scale * x[:n] / x[n : 2 * n]
-        eps_r = float(x[2 * n]) if self.electric else self.material.eps_r
-        return Material(name="identified", mu=tuple(mu), alpha=tuple(x[n : 2 * n]), eps_r=eps_r)
+        n = self.film_numbers
+        alpha = x[self.moduli : n]
+        mu = self.scale * x[: self.moduli] / self.law.weights(alpha)[0]
+        eps_r = float(x[n]) if self.electric else self.material.eps_r
+        return Material(name="identified", mu=tuple(mu), alpha=tuple(alpha), eps_r=eps_r, law=self.law)
 
     def vector(self, material: Material) -> Array:
         """The parameter vector of a material, nuisances at zero."""
         mu, alpha = np.array(material.mu), np.array(material.alpha)
         eps = [material.eps_r] if self.electric else []
-        return np.concatenate((mu * alpha / (2.0 * self.scale), alpha, eps, np.zeros(len(self.nuisances))))
+        shares = mu * self.law.weights(alpha)[0] / self.scale
+        return np.concatenate((shares, alpha, eps, np.zeros(len(self.nuisances))))
 
     def bounds(self, x: Array) -> tuple[Array, Array]:
         """Lower and upper bounds of a parameter vector; exponents keep the sign they have in ``x``."""
-        n = self.terms
+        n = self.film_numbers
         lower, upper = np.full(x.size, -np.inf), np.full(x.size, np.inf)
-        lower[:n], upper[:n] = SHARE_BOUNDS
-        negative = x[n : 2 * n] < 0.0
-        lower[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[1], EXPONENT_BOUNDS[0])
-        upper[n : 2 * n] = np.where(negative, -EXPONENT_BOUNDS[0], EXPONENT_BOUNDS[1])
+        lower[:n], upper[:n] = np.array([p.search for p in self.parameters]).T
+        mirrored = self.law.series & (np.arange(n) >= self.moduli) & (x[:n] < 0.0)
+        lower[:n], upper[:n] = np.where(mirrored, -upper[:n], lower[:n]), np.where(mirrored, -lower[:n], upper[:n])
         if self.electric:
-            lower[2 * n], upper[2 * n] = PERMITTIVITY_BOUNDS
+            lower[n], upper[n] = PERMITTIVITY_BOUNDS
         return lower, upper
 
     def by_parameters(self, x: Array, by_mu: Array, by_alpha: Array, by_eps: Array) -> Array:
-        """Derivatives by x (..., P) from those by mu, alpha (both (..., N)) and eps_r (...); nuisances get 0."""
-        n = self.terms
-        alpha = x[..., n : 2 * n]
-        mu = 2.0 * self.scale * x[..., :n] / alpha
-        parts = [by_mu * 2.0 * self.scale / alpha, by_alpha - by_mu * mu / alpha]
+        """Derivatives by x (..., P) from those by mu (..., moduli), alpha (..., shapes) and eps_r (...).
+
+        Nuisances get 0.
+        """
+        alpha = x[..., self.moduli : self.film_numbers]
+        weighed = [self.law.weights(one) for one in alpha.reshape(math.prod(alpha.shape[:-1]), alpha.shape[-1])]
+        weight = np.array([w for w, _ in weighed]).reshape(*alpha.shape[:-1], self.moduli)
+        slope = np.array([by for _, by in weighed]).reshape(*weight.shape, alpha.shape[-1])
+        by_share = by_mu * self.scale / weight
+        through_mu = (by_share * x[..., : self.moduli] / weight)[..., None] * slope
+        parts = [by_share, by_alpha - through_mu.sum(axis=-2)]
         if self.electric:
             parts.append(by_eps[..., None])
         parts.append(np.zeros((*by_mu.shape[:-1], len(self.nuisances))))
@@ -476,7 +487,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """The model at the nodes: arrays of shape (rows, nodes), by mu and alpha (rows, nodes, N), or with S before.
+    """The model at the nodes: arrays (rows, nodes), by mu and alpha (rows, nodes, numbers), or with S before.
 
     ``by`` holds the derivatives of the force, with the keys of `model.membrane.solve.Solutions.dforce`.
     """

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.problem import Problem
-from calibration.film.propagation import NUISANCES, SYSTEMATIC, Covariance, secant
+from calibration.film.propagation import NUISANCES, SYSTEMATIC, Covariance, secant, shear_slopes
 from calibration.film.result import Quantity, verdict
 from calibration.film.search import Minimum, minimise_many
 
@@ -51,12 +51,12 @@ def intervals(
     misfit : float
         Lack of fit over its expectation; divides the cost.
     """
-    n = problem.terms
+    n = problem.moduli
     ends = {
         name: [quantities[name].value + side * NORMAL_95 * _random(quantities[name], misfit) for side in (-1.0, 1.0)]
         for name in aims
     }
-    if n == 1 or not varied[n]:
+    if not problem.law.series or n == 1 or not varied[n]:
         return {name: (low, high) for name, (low, high) in ends.items()}
     steps = _steps(problem, x, bounds, varied)
     least = min(step.cost for step in steps)
@@ -100,7 +100,7 @@ def _steps(problem: Problem, x: Array, bounds: tuple[Array, Array], varied: NDAr
 
     All are sought at once from the minimum, and then again from what was found for the neighbours.
     """
-    n = problem.terms
+    n = problem.moduli
     sign = math.copysign(1.0, x[n])
     ladder = sign * np.array(sorted({*EXPONENTS, abs(float(x[n]))}))
     fitted = varied.copy()
@@ -133,23 +133,22 @@ def _steps(problem: Problem, x: Array, bounds: tuple[Array, Array], varied: NDAr
 
 def targets(problem: Problem, stretch: tuple[float, float], held: Collection[str]) -> dict[str, Target]:
     """``G``, ``stiffness`` and, where it was fitted, ``eps_r`` as functions of the parameter vector."""
-    n = problem.terms
+    n = problem.film_numbers
     flat = np.zeros(())
 
     def shear_modulus(x: Array) -> tuple[float, Array]:
         film = problem.film(x)
-        alpha, mu = np.array(film.alpha), np.array(film.mu)
-        return film.shear_modulus, problem.by_parameters(x, alpha / 2.0, mu / 2.0, flat)
+        return film.shear_modulus, problem.by_parameters(x, *shear_slopes(film), flat)
 
     def stiffness(x: Array) -> tuple[float, Array]:
         film = problem.film(x)
-        value, by_mu, by_alpha = secant(np.array(film.mu), np.array(film.alpha), np.array([stretch[0]]), stretch[1])
+        value, by_mu, by_alpha = secant(film, np.array([stretch[0]]), stretch[1])
         return float(value[0]), problem.by_parameters(x, by_mu[0], by_alpha[0], flat)
 
     def permittivity(x: Array) -> tuple[float, Array]:
         gradient = np.zeros(x.size)
-        gradient[2 * n] = 1.0
-        return float(x[2 * n]), gradient
+        gradient[n] = 1.0
+        return float(x[n]), gradient
 
     found: dict[str, Target] = {"G": shear_modulus, "stiffness": stiffness}
     if problem.electric and "eps_r" not in held:

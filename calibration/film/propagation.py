@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from calibration.film.curve import Curve
 from calibration.film.misfit import likely
-from calibration.film.problem import DIMENSIONS, EXPONENT_BOUNDS, Problem
+from calibration.film.problem import DIMENSIONS, Problem
 from calibration.film.result import Quantity, RigParameter, Stiffness, Suspect, verdict
+from model.material.law import Law, stack
 from model.material.materials import Material
 
 Array = NDArray[np.float64]
@@ -36,8 +37,6 @@ OF_DIMENSIONS |= {"ring_radius": "ring radius"}
 
 # What is fitted along, and its unit.
 NUISANCES = {"force_zero": "N", "displacement_zero": "m", "lag": "s", "compliance": "m/N"}
-# Standard deviation of an exponent of which no more is known than its range (rectangular: JCGM 100:2008, 4.3.7).
-EXPONENT_DEVIATION = (EXPONENT_BOUNDS[1] - EXPONENT_BOUNDS[0]) / math.sqrt(12.0)
 # Meridional stretch over pre-stretch to which a stiffness belongs that can be compared between runs.
 FIXED = 1.25
 NEGLIGIBLE = 1e-3  # of the noise: what is less has no line in a budget
@@ -60,31 +59,60 @@ def secant_modulus(material: Material, meridional: float, hoop: float) -> float:
 
     It is what a force measures, since ``2 pi R (T/lp) S1 sin(theta) = F``. For small strains it becomes ``G``.
     """
-    mu, alpha = np.array(material.mu), np.array(material.alpha)
-    return float(secant(mu, alpha, np.array([meridional]), hoop)[0][0])
+    return float(secant(material, np.array([meridional]), hoop)[0][0])
 
 
 def least_tangent(material: Material, meridional: float, hoop: float) -> float:
     r"""Smallest tangent modulus (Pa) for stretches from 1 to ``meridional`` and ``hoop``; above 0 in a stable film.
 
-    The smaller eigenvalue of the second derivatives of W by the logarithms of the two stretches (Drucker, Hill).
-    With every ``mu_n alpha_n > 0`` it is positive whatever the stretch.
+    The smaller eigenvalue of the second derivatives of W by the logarithms of the two stretches (Drucker, Hill). Of
+    Ogden terms it is positive whatever the stretch with every ``mu_n alpha_n > 0``.
     """
-    mu, alpha = np.array(material.mu), np.array(material.alpha)
     one, two = (np.log(np.linspace(1.0, end, 25)) for end in (max(meridional, 1.0), max(hoop, 1.0)))
-    l1, l2 = (grid[..., None] for grid in np.meshgrid(one, two))
-    own1, own2, shared = (np.exp(alpha * power) @ (mu * alpha) for power in (l1, l2, -(l1 + l2)))
-    mean, half = 0.5 * (own1 + own2) + shared, 0.5 * (own1 - own2)
-    return float((mean - np.hypot(half, shared)).min())
+    return float(law_of(material).least_tangent(*np.meshgrid(one, two)).min())
 
 
-def secant(mu: Array, alpha: Array, meridional: Array, hoop: float) -> tuple[Array, Array, Array]:
-    """Secant modulus at k meridional stretches, with derivatives by mu and by alpha; shapes (k,), (k, N), (k, N)."""
-    l1 = meridional[:, None]
-    stretch = l1**alpha - (l1 * hoop) ** -alpha
-    by_alpha = mu * (l1**alpha * np.log(l1) + (l1 * hoop) ** -alpha * np.log(l1 * hoop))
-    neo_hookean = l1**2 - (l1 * hoop) ** -2.0
-    return (stretch @ mu) / neo_hookean[:, 0], stretch / neo_hookean, by_alpha / neo_hookean
+def law_of(material: Material) -> Law:
+    """The material's law with its parameters (Pa)."""
+    return material.law(np.array(material.mu)[:, None], np.array(material.alpha).reshape(-1, 1))
+
+
+def secant(material: Material, meridional: Array, hoop: float) -> tuple[Array, Array, Array]:
+    """Secant modulus at k meridional stretches, with derivatives by mu and alpha: (k,), (k, moduli), (k, shapes)."""
+    log1 = np.log(meridional)
+    log = stack(log1, np.full(log1.shape, math.log(hoop)))
+    neo_hookean = meridional**2 - (meridional * hoop) ** -2.0
+    law = law_of(material)
+    by_mu, by_alpha = law.by_parameters(log)
+    return law.derivatives(log)[0] / neo_hookean, (by_mu[:, 0] / neo_hookean).T, (by_alpha[:, 0] / neo_hookean).T
+
+
+def shear_slopes(material: Material) -> tuple[Array, Array]:
+    """Derivatives of the small-strain shear modulus by mu and by alpha."""
+    found = []
+    for values, shares in ((material.mu, True), (material.alpha, False)):
+        slopes = np.zeros(len(values))
+        for n, value in enumerate(values):
+            step = 1e-4 * max(abs(value), 1e-6)
+            ends = []
+            for side in (step, -step):
+                moved = (*values[:n], value + side, *values[n + 1 :])
+                ends.append(
+                    material.law.shear_modulus(moved, material.alpha)
+                    if shares
+                    else material.law.shear_modulus(material.mu, moved)
+                )
+            slopes[n] = (ends[0] - ends[1]) / (2.0 * step)
+        found.append(slopes)
+    return found[0], found[1]
+
+
+def sorted_terms(material: Material) -> Material:
+    """The terms of a series sorted by their exponents, by which they are told apart; another law as it is."""
+    if not material.law.series:
+        return material
+    alpha, mu = zip(*sorted(zip(material.alpha, material.mu, strict=True)), strict=True)
+    return replace(material, mu=mu, alpha=alpha)
 
 
 class Covariance:
@@ -111,6 +139,14 @@ class Covariance:
         return matrix
 
 
+def _range_rows(problem: Problem, size: int) -> Array:
+    """Rows that say of every shape parameter no more than its range (rectangular: JCGM 100:2008, 4.3.7)."""
+    n = problem.moduli
+    width = np.array([high - low for low, high in (p.search for p in problem.parameters[n:])])
+    rows = np.eye(len(width), size, n)
+    return rows * (math.sqrt(12.0) / width)[:, None] if len(width) else rows
+
+
 class Propagation:
     """Standard uncertainties of functions of the film's parameters, part by part.
 
@@ -134,7 +170,7 @@ class Propagation:
         self.problem = problem
         self.film = problem.film(x)
         jacobian = problem.jacobian(x)
-        known = np.eye(problem.terms, x.size, problem.terms) / EXPONENT_DEVIATION if ranges else np.empty((0, x.size))
+        known = _range_rows(problem, x.size) if ranges else np.empty((0, x.size))
         self.covariance = Covariance(np.concatenate((jacobian, known)), free)
         self.response = self.covariance.response[:, : len(jacobian)]
         self.misfit = misfit
@@ -236,9 +272,10 @@ class Propagation:
 
 def determined(problem: Problem, at_bound: NDArray[np.bool_], held: Collection[str]) -> NDArray[np.bool_]:
     """Entries of x that the data bear on: not held, and not the exponent of a term without stiffness."""
-    n = problem.terms
+    n = problem.moduli
     free = np.array([name not in held for name in problem.names])
-    free[n : 2 * n] &= ~at_bound[:n]
+    if problem.law.series:
+        free[n : 2 * n] &= ~at_bound[:n]
     return free
 
 
@@ -280,42 +317,38 @@ def state(
     and the permittivity count on exponents being in their range. The terms, and the stiffness at stretches that were
     reached, stand as the data alone have them.
     """
-    n = problem.terms
-    vanished = at_bound[:n]
+    vanished = at_bound[: problem.moduli]
     free = determined(problem, at_bound, held)
     propagation = Propagation(problem, x, free, misfit, rivals, doubts)
     derived = Propagation(problem, x, free, misfit, rivals, doubts, ranges=True) if ranges else propagation
     film = propagation.film
-    mu, alpha = np.array(film.mu), np.array(film.alpha)
-    zero, unit = np.zeros(n), np.eye(n)
+    zeros = np.zeros(len(film.mu)), np.zeros(len(film.alpha))
 
     def gradient(by_mu: Array, by_alpha: Array, by_eps: float = 0.0) -> Array:
         return problem.by_parameters(x, by_mu, by_alpha, np.array(by_eps))
 
     quantities: dict[str, Quantity] = {}
     slopes: dict[str, Array] = {}
-    for k in range(n):
-        name = f"mu{k + 1}"
-        slopes[name] = gradient(unit[k], zero)
+    of_law = _law_parameters(problem, held)
+    for name, kind, k in of_law:
+        term = vanished[k] if kind == "mu" or problem.law.series else np.False_
+        shape = kind == "alpha" and at_bound[problem.moduli + k]
+        unit = [zero.copy() for zero in zeros]
+        unit[kind == "alpha"][k] = 1.0
+        slopes[name] = gradient(unit[0], unit[1])
         quantities[name] = propagation.quantity(
-            partial(_entry, "mu", k), slopes[name], "Pa", at_bound=bool(vanished[k])
+            partial(_entry, kind, k),
+            slopes[name],
+            "Pa" if kind == "mu" else "1",
+            at_bound=bool(term or shape),
+            known=bool(kind == "mu" or not term),
         )
-        name = f"alpha{k + 1}"
-        if name not in held:
-            slopes[name] = gradient(zero, unit[k])
-            quantities[name] = propagation.quantity(
-                partial(_entry, "alpha", k),
-                slopes[name],
-                "1",
-                at_bound=bool(vanished[k] or at_bound[n + k]),
-                known=not vanished[k],
-            )
-    quantities["G"] = derived.quantity(lambda m: m.shear_modulus, gradient(alpha / 2.0, mu / 2.0), "Pa")
+    quantities["G"] = derived.quantity(lambda m: m.shear_modulus, gradient(*shear_slopes(film)), "Pa")
 
     hoop = float(np.mean([problem.curves[i].specimen.prestretch for i in problem.active]))
     longest = max(float(problem.states(x).max_stretch.max()), hoop + 0.02)
     stretches = np.arange(math.floor(hoop * 100) + 1, math.floor(longest * 100) + 1) / 100
-    _, by_mu, by_alpha = secant(mu, alpha, stretches, hoop)
+    _, by_mu, by_alpha = secant(film, stretches, hoop)
     along = [
         propagation.quantity(partial(secant_modulus, meridional=stretch, hoop=hoop), gradient(a, b), "Pa")
         for stretch, a, b in zip(stretches, by_mu, by_alpha, strict=True)
@@ -323,20 +356,21 @@ def state(
     at = min(range(len(along)), key=lambda k: along[k].relative)
     quantities["stiffness"] = along[at]
     fixed = (round(FIXED * hoop, 2), hoop) if fixed_stretch is None else fixed_stretch
-    _, fixed_mu, fixed_alpha = secant(mu, alpha, np.array([fixed[0]]), fixed[1])
+    _, fixed_mu, fixed_alpha = secant(film, np.array([fixed[0]]), fixed[1])
     quantities["stiffness_fixed"] = propagation.quantity(
         partial(secant_modulus, meridional=fixed[0], hoop=fixed[1]), gradient(fixed_mu[0], fixed_alpha[0]), "Pa"
     )
     quantities["stiffness_end"] = along[-1]
     if problem.electric and "eps_r" not in held:
-        slopes["eps_r"] = gradient(zero, zero, 1.0)
-        quantities["eps_r"] = derived.quantity(lambda m: m.eps_r, slopes["eps_r"], "1", at_bound=bool(at_bound[2 * n]))
+        slopes["eps_r"] = gradient(*zeros, 1.0)
+        quantities["eps_r"] = derived.quantity(
+            lambda m: m.eps_r, slopes["eps_r"], "1", at_bound=bool(at_bound[problem.film_numbers])
+        )
 
     told = {"stiffness": gradient(by_mu[at], by_alpha[at]), **({"eps_r": slopes["eps_r"]} if "eps_r" in slopes else {})}
 
     if vanished.any():  # what is left is another model: its terms are not those that were asked for
-        lost = [name for name in quantities if name.startswith(("mu", "alpha"))]
-        quantities |= {name: replace(quantities[name], verdict=verdict(math.inf, True)) for name in lost}
+        quantities |= {name: replace(quantities[name], verdict=verdict(math.inf, True)) for name, _, _ in of_law}
 
     nuisance = {}
     for k, one in enumerate(problem.nuisances, start=problem.film_parameters):
@@ -392,6 +426,17 @@ def _differences(propagation: Propagation, x: Array) -> dict[str, RigParameter]:
                 unit="1",
             )
     return found
+
+
+def _law_parameters(problem: Problem, held: Collection[str]) -> list[tuple[str, str, int]]:
+    """Name, kind ("mu" or "alpha") and number of what was fitted of the law, term by term in a series."""
+    n, shapes = problem.moduli, problem.film_numbers - problem.moduli
+    names = problem.law.names(n, shapes)
+    found = [(name, "mu", k) for k, name in enumerate(names[:n])]
+    found += [(name, "alpha", k) for k, name in enumerate(names[n:])]
+    if problem.law.series:
+        found.sort(key=lambda one: one[2])
+    return [one for one in found if one[0] not in held]
 
 
 def _entry(name: str, k: int, film: Material) -> float:

@@ -366,8 +366,14 @@ class Identification:
 
     @property
     def terms(self) -> int:
-        """Number of Ogden terms."""
-        return len(self.material.mu)
+        """Number of terms of a series; 1 of another law."""
+        return self.material.terms
+
+    @property
+    def model(self) -> str:
+        """The law, and the number of terms of a series: "Ogden law with 2 terms"."""
+        terms = f" with {self.terms} term{'s' if self.terms > 1 else ''}" if self.material.law.series else ""
+        return f"{self.material.law.title} law{terms}"
 
     @property
     def wrinkling(self) -> Wrinkling:
@@ -408,8 +414,9 @@ class Identification:
         """Plain numbers, strings, lists and dictionaries; a number that is not finite becomes None."""
         return {
             "format": "dea-rig identification 1",
-            "model": "incompressible Ogden film, axisymmetric membrane, ideal dielectric",
-            "convention": CONVENTION,
+            "model": f"incompressible {self.material.law.title} film, axisymmetric membrane, ideal dielectric",
+            "convention": self.material.law.description,
+            "law": self.material.law.name,
             "terms": self.terms,
             "quantities": {name: quantity_dict(q) for name, q in self.quantities.items()},
             "stiffness_at": {"meridional_stretch": self.stretch[0], "hoop_stretch": self.stretch[1]},

@@ -109,8 +109,9 @@ def _step(
     unit = np.eye(x.shape[1])
     damped += unit * np.where(blocked, 1.0, damping[:, None] * floor)[:, None, :]
     step = -np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
-    n = problem.terms
-    big = slice(n, problem.film_parameters)  # exponents and permittivity, beyond whose reach the model is too bent
+    big = slice(
+        problem.moduli, problem.film_parameters
+    )  # exponents and permittivity, beyond whose reach the model is too bent
     ratio = (np.abs(step[:, big]) / (LARGEST_CHANGE * np.maximum(1.0, np.abs(x[:, big])))).max(axis=1)
     step /= np.maximum(ratio, 1.0)[:, None]
     clipped = np.clip(x + step, *bounds) - x

@@ -73,7 +73,7 @@ def summarise(
         fixed_stretch=fixed_stretch,
     )
     quantities = stated.quantities
-    if profiles or fit.at_bound[: problem.terms].any():  # where a term has vanished, curvature says nothing of it
+    if profiles or fit.at_bound[: problem.moduli].any():  # where a term has vanished, curvature says nothing of it
         aims = targets(problem, stated.stretch, held)
         found = intervals(problem, x, problem.bounds(x), fit.varied, quantities, aims, misfit)
         quantities.update({name: widened(quantities[name], ends, misfit) for name, ends in found.items()})

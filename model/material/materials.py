@@ -109,6 +109,11 @@ class Material:
         """Every parameter by the name that results call it: "mu1", "alpha1" of the first Ogden term, "Jm"."""
         return dict(zip(self.law.names(len(self.mu), len(self.alpha)), (*self.mu, *self.alpha), strict=True))
 
+    @property
+    def terms(self) -> int:
+        """Number of terms of a series; 1 of another law."""
+        return len(self.mu) // len(self.law.moduli) if self.law.series else 1
+
     def with_value(self, name: str, value: float) -> Material:
         """The material with another value of one parameter, named as in ``values``, or of "eps_r".
 

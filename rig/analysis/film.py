@@ -15,6 +15,8 @@ from calibration.film.curve import Curve, CurveError
 from calibration.film.identify import IdentificationError, compare, identify
 from calibration.film.result import Identification
 from calibration.sensors.certificate import Certificate
+from model.material.law import Law
+from model.material.laws import find_law
 from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
 from rig.base.outputs import write_text
@@ -54,6 +56,7 @@ class Found:
 def identify_logs(
     paths: Sequence[Path],
     *,
+    law: str | None = None,
     terms: int = 2,
     comparing: bool = False,
     profiles: bool = False,
@@ -63,14 +66,15 @@ def identify_logs(
 ) -> Found:
     """Identify the film from all recorded curves of all logs at once.
 
-    ``comparing`` judges 1, 2 and 3 Ogden terms beside each other, ``profiles`` adds 95 % intervals from profile
-    likelihood; each takes a few seconds more. ``posterior`` adds Markov chains, which take a minute or more and tell
-    ``progress``. ``wrinkled`` is "left-out" or "tension-field".
+    ``law`` is the name of the law to fit, the scene's when not given. ``comparing`` judges 1, 2 and 3 Ogden terms
+    beside each other, ``profiles`` adds 95 % intervals from profile likelihood; each takes a few seconds more.
+    ``posterior`` adds Markov chains, which take a minute or more and tell ``progress``. ``wrinkled`` is "left-out" or
+    "tension-field".
 
     Raises
     ------
     LogError, DataError
-        When a log cannot be read, lacks what is needed, or the curves cannot be fitted.
+        When a log cannot be read, lacks what is needed, or the curves cannot be fitted; when there is no such law.
     """
     runs = [load_run(path) for path in paths]
     scenes = [parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)") for run in runs]
@@ -103,6 +107,7 @@ def identify_logs(
         wrinkled=wrinkled,
         posterior=posterior,
         progress=progress,
+        law=scenes[0].specimen.specimen().material.law if law is None else law_called(law),
         reach=min(scene.limits.displacement_mm for scene in scenes) * 1e-3,
     )
     return replace(identified, runs=runs, truth=_truth(runs, scenes), notes=_notes(runs))
@@ -118,9 +123,12 @@ def identify_curves(
     wrinkled: str = "left-out",
     posterior: bool = False,
     progress: Callable[[float, float, str], None] = lambda done, total, label: None,
+    law: type[Law] | None = None,
     reach: float = math.inf,
 ) -> Found:
     """Identify the film from curves, wherever they come from; options as in `identify_logs`.
+
+    ``law`` is that of the specimens' material when not given.
 
     Raises
     ------
@@ -132,9 +140,12 @@ def identify_curves(
         "provenance": provenance,
         "wrinkling": "tension_field" if wrinkled == "tension-field" else "plain",
         "reach": reach,
+        "law": law or curves[0].specimen.material.law,
     }
+    counts = (1, 2, 3) if options["law"].series else (1,)
+    terms = min(terms, counts[-1])
     try:
-        comparison = compare(curves, **options) if comparing else []
+        comparison = compare(curves, terms=counts, **options) if comparing else []
         same = [one for one in comparison if one.terms == terms]
         identification = same[0] if same else identify(curves, terms=terms, **options)
         if posterior:
@@ -144,6 +155,14 @@ def identify_curves(
     except (CurveError, IdentificationError) as error:
         raise DataError(f"{error}.") from None
     return Found(identification, curves, [], provenance, None, [], comparison)
+
+
+def law_called(name: str) -> type[Law]:
+    """The law of that name. Raises `DataError` when there is none."""
+    try:
+        return find_law(name)
+    except ValueError as error:
+        raise DataError(f"{error}.") from None
 
 
 def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certificate]) -> Curve:

@@ -11,7 +11,7 @@ from typing import Any
 
 from calibration.film.curve import CurveError
 from calibration.sheet.sheet_tests import HomogeneousTest, TestsError, TestsFit, fit_tests
-from rig.analysis.film import UNKNOWN_LAG, Found, dimension_errors, identify_curves
+from rig.analysis.film import UNKNOWN_LAG, Found, dimension_errors, identify_curves, law_called
 from rig.base.errors import ConfigError, DataError
 from rig.base.table import Table
 from rig.base.text_file import read_text
@@ -63,8 +63,10 @@ def read_cones(paths: Sequence[Path], scene: Path, options: ImportOptions) -> Co
         raise DataError(f"{error}.") from None
 
 
-def identify_cones(table: ConeTable, paths: Sequence[Path], scene: Path, **options: Any) -> Found:
-    """`identify_curves` on the curves of tables; ``options`` as there.
+def identify_cones(
+    table: ConeTable, paths: Sequence[Path], scene: Path, *, law: str | None = None, **options: Any
+) -> Found:
+    """`identify_curves` on the curves of tables; ``options`` as there. ``law`` is named, the scene's when not given.
 
     Raises
     ------
@@ -76,7 +78,8 @@ def identify_cones(table: ConeTable, paths: Sequence[Path], scene: Path, **optio
         "tables": {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths},
         "import": [one.to_dict() for one in table.understood],
     }
-    found = identify_curves(table.curves, provenance, **options)
+    law_of = None if law is None else law_called(law)
+    found = identify_curves(table.curves, provenance, law=law_of, **options)
     notes = [str(one) for each in table.understood for one in each.findings if one.severity == "warning"]
     notes.append(
         "noise is estimated from the scatter of the readings; gains (force and displacement 0.5 %, voltage 1 %), the "
@@ -111,8 +114,8 @@ def read_sheets(paths: Sequence[Path], predict: Sequence[Path], options: ImportO
     return SheetsRead(tests, predicted, found.understood)
 
 
-def identify_sheets(read: SheetsRead, **options: Any) -> TestsFit:
-    """`fit_tests` on tests that were read; ``options`` as there.
+def identify_sheets(read: SheetsRead, *, law: str = "ogden", **options: Any) -> TestsFit:
+    """`fit_tests` on tests that were read; ``options`` as there, the law by its name.
 
     Raises
     ------
@@ -120,6 +123,6 @@ def identify_sheets(read: SheetsRead, **options: Any) -> TestsFit:
         When the tests cannot be fitted.
     """
     try:
-        return fit_tests(read.tests, predict=read.predict, **options)
+        return fit_tests(read.tests, law=law_called(law), predict=read.predict, **options)
     except TestsError as error:
         raise DataError(f"{error}.") from None

@@ -84,8 +84,8 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
     """Plan ``time`` seconds of the rig for the scene in ``scene_path``.
 
     What is best to do depends on the film: ``film`` takes the place of the scene's material where more is known. It
-    depends on the model, too: with ``terms = 1`` it is made for the one-term film like it, and then tells little to a
-    fit with two.
+    depends on the model, too: with ``terms = 1`` it is made for the film of one Ogden term like it, and then tells
+    little to a fit with two.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
     certificates = certificates_of(scene, scene_path)
     specimen = scene.specimen.specimen()
     specimen = specimen if film is None else specimen.with_material(film)
-    if terms == 1 and len(specimen.material.mu) > 1:
+    if terms == 1 and specimen.material.terms > 1:
         lp = specimen.prestretch
         specimen = specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
     h, voltage, sweep_h, sweep_v = _reachable(scene, specimen)

@@ -102,7 +102,7 @@ def truth_table(found: Found) -> RenderableType:
     """The simulation's hidden truth beside what was identified, the difference in stated standard uncertainties."""
     from rich.table import Table
 
-    from calibration.film.identify import secant_modulus
+    from calibration.film.propagation import secant_modulus, sorted_terms
     from calibration.rounding import stated
     from rig.cli.show import NAMES, SHOWN
 
@@ -117,9 +117,8 @@ def truth_table(found: Found) -> RenderableType:
         ),
         "G": truth.shear_modulus,
     }
-    if len(truth.mu) == identification.terms:
-        for n, (mu, alpha) in enumerate(sorted(zip(truth.mu, truth.alpha, strict=True), key=lambda term: term[1])):
-            known |= {f"mu{n + 1}": mu, f"alpha{n + 1}": alpha}
+    if (truth.law, truth.terms) == (identification.material.law, identification.terms):
+        known |= sorted_terms(truth).values
     table = Table(title="Truth against identified")
     for heading in ("quantity", "truth", "identified", "unit", "+-", "off / +-"):
         table.add_column(heading, justify="left" if heading in ("quantity", "unit") else "right", no_wrap=True)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 @click.option("--scene", type=FILE, help="Scene whose [specimen] the tables are of; logs have their own inside.")
 @click.option("-o", "--out", type=FILE, help="Result as JSON.")
 @click.option("--report", type=FILE, help="Result as one self-contained HTML page.")
+@click.option("--law", help="Law of the film, e.g. gent; that of the scene when not given.")
 @click.option("--terms", type=click.IntRange(1, 3), default=2, show_default=True, help="Ogden terms.")
 @click.option("--compare", "comparing", is_flag=True, help="Judge 1, 2 and 3 terms: AICc, BIC, held-out curves.")
 @click.option("--profiles", is_flag=True, help="95 % intervals from profile likelihood too; takes longer.")
@@ -41,6 +42,7 @@ def command(
     scene: Path | None,
     out: Path | None,
     report: Path | None,
+    law: str | None,
     terms: int,
     comparing: bool,
     profiles: bool,
@@ -50,7 +52,7 @@ def command(
     tidy: Path | None,
     **words: Any,
 ) -> None:
-    """Identify Ogden parameters and permittivity from all curves of LOGS at once, with uncertainties.
+    """Identify the film's law and permittivity from all curves of LOGS at once, with uncertainties.
 
     LOGS are logs of this program; or, with --scene, tables of another rig with columns of displacement, force and
     voltage, in any encoding, separator and decimal sign. What is understood of a table is printed first; what cannot be
@@ -78,6 +80,7 @@ def command(
         return
     with progress("Markov chains around the fit") if posterior else nullcontext(lambda *_: None) as update:
         settings: dict[str, Any] = {
+            "law": law,
             "terms": terms,
             "comparing": comparing,
             "profiles": profiles,
@@ -124,7 +127,7 @@ def identification_table(found: Identification) -> Group:
     from rig.cli.show import NAMES, quantities_table
 
     table = quantities_table(
-        f"Identified with {found.terms} Ogden terms, {found.used} samples, {found.excluded} left out", found.quantities
+        f"Identified: {found.model}, {found.used} samples, {found.excluded} left out", found.quantities
     )
     lines: list[RenderableType] = [
         table,

@@ -19,19 +19,21 @@ if TYPE_CHECKING:
 @click.command("fit-tests")
 @click.argument("tests", nargs=-1, required=True, type=FILE)
 @click.option("-o", "--out", type=FILE, help="Result as JSON.")
+@click.option("--law", default="ogden", show_default=True, help="Law of the sheet, e.g. yeoh.")
 @click.option("--terms", type=click.IntRange(1, 4), default=3, show_default=True, help="Ogden terms.")
 @click.option("--predict", multiple=True, type=FILE, help="A test that takes no part and is predicted.")
 @import_options(sheet=True)
 def command(
     tests: tuple[Path, ...],
     out: Path | None,
+    law: str,
     terms: int,
     predict: tuple[Path, ...],
     dry_run: bool,
     tidy: Path | None,
     **words: Any,
 ) -> None:
-    """Identify Ogden parameters from homogeneous TESTS of a sheet, all at once.
+    """Identify a law from homogeneous TESTS of a sheet, all at once.
 
     TESTS are tables as testing machines and spreadsheets write them: text in any encoding, separator and decimal sign,
     with columns of stretch, strain or extension, and of nominal stress or force. What is understood of each is printed
@@ -49,7 +51,7 @@ def command(
 
         write_sheet_tests(tidy, read.tests)
     if not dry_run:
-        found = identify_sheets(read, terms=terms)
+        found = identify_sheets(read, terms=terms, law=law)
         if out is not None:
             write_text(out, with_import(found.to_json(), read.understood))
         show(tests_table(found))
@@ -57,13 +59,15 @@ def command(
 
 
 def tests_table(found: TestsFit) -> Group:
-    """Ogden terms from homogeneous tests, and how much of each test they explain."""
+    """The law from homogeneous tests, and how much of each test they explain."""
     from rich.console import Group
     from rich.table import Table
 
     from rig.cli.show import quantities_table
 
-    table = quantities_table(f"Identified from homogeneous tests with {len(found.mu)} Ogden terms", found.quantities)
+    terms = f" with {len(found.mu)} terms" if found.law.series else ""
+    title = f"Identified from homogeneous tests: {found.law.title} law{terms}"
+    table = quantities_table(title, found.quantities)
     explained = Table(title="Share of variance explained, R^2")
     explained.add_column("test")
     explained.add_column("fitted", justify="right")

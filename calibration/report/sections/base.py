@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import Any
 
 from calibration.film.curve import Curve
-from calibration.film.propagation import secant_modulus
+from calibration.film.propagation import secant_modulus, sorted_terms
 from calibration.film.reduction import Selection
 from calibration.film.result import Identification, Quantity
 from calibration.rounding import percent, rounded, stated
@@ -22,8 +22,8 @@ _SHOWN = {
     "stiffness_end": ("G", "end", "secant shear modulus at the largest stretch"),
     "eps_r": ("ε", "r", "relative permittivity"),
     "G": ("G", "", "small-strain shear modulus"),
-    "mu": ("μ", "", "Ogden modulus"),
-    "alpha": ("α", "", "Ogden exponent"),
+    "mu": ("μ", "", "modulus"),
+    "alpha": ("α", "", "exponent"),
 }
 BADGES = {"identified": "good", "weakly identified": "fair"}  # how a verdict is marked; else "bad"
 
@@ -86,9 +86,8 @@ class ReportData:
             "stiffness": secant_modulus(truth, *found.stretch),
             "stiffness_end": secant_modulus(truth, found.stiffness_curve.meridional_stretch[-1], found.stretch[1]),
         }
-        if len(truth.mu) == found.terms:
-            for n, (alpha, mu) in enumerate(sorted(zip(truth.alpha, truth.mu, strict=True)), start=1):
-                known |= {f"mu{n}": mu, f"alpha{n}": alpha}
+        if (truth.law, truth.terms) == (found.material.law, found.terms):
+            known |= sorted_terms(truth).values
         return known
 
     @cached_property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from calibration.film.result import CONVENTION, IDENTIFIED, WEAKLY_IDENTIFIED
+from calibration.film.result import IDENTIFIED, WEAKLY_IDENTIFIED
 from calibration.report.sections.base import ReportData, Section, Table, symbol
 
 
@@ -23,7 +23,7 @@ def context(data: ReportData) -> Mapping[str, Any]:
         rows.append([symbol(name), row.meaning, *numbers, *([row.truth, row.deviation] if known else []), badge])
     return {
         "quantities": Table([*headings, "verdict"], rows),
-        "convention": CONVENTION,
+        "convention": data.identification.material.law.description,
         "thresholds": (f"{IDENTIFIED:.0%}", f"{WEAKLY_IDENTIFIED:.0%}"),
         "known": known,
     }
@@ -32,7 +32,7 @@ def context(data: ReportData) -> Mapping[str, Any]:
 TEMPLATE = """
 <h2>Parameters</h2>
 {{ table(quantities) }}
-<p class="soft">Convention: {{ convention }}. Other codes use moduli <i>μ α</i>/2. "Identified" means a relative
+<p class="soft">Convention: {{ convention }} "Identified" means a relative
 standard uncertainty of
 at most {{ thresholds[0] }}, "weakly identified" of at most {{ thresholds[1] }}.{% if known %} "Off by" counts
 standard

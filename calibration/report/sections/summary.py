@@ -25,7 +25,7 @@ def context(data: ReportData) -> Mapping[str, Any]:
 TEMPLATE = """
 <h1>Film parameters from force and displacement</h1>
 <p class="soft">{{ specimens | join(", ") }} · {{ fit.curves | length }} curves · {{ fit.used }} samples used,
-{{ fit.excluded }} left out · Ogden model with {{ fit.terms }} term{{ "s" if fit.terms > 1 }}</p>
+{{ fit.excluded }} left out · {{ fit.model }}</p>
 <div class="answers">
 {% for name, row in headline.items() %}
 <div class="answer">
@@ -53,7 +53,7 @@ that are merely smooth, the model leaves {{ "%.2f" | format(misfit) }} times the
 <li>{{ warning }}</li>
 {% endfor %}
 {% if fit.advice %}
-<li>What would determine the Ogden terms better: {{ fit.advice | join("; ") }}.</li>
+<li>What would determine the parameters better: {{ fit.advice | join("; ") }}.</li>
 {% endif %}
 </ul>
 {% endif %}

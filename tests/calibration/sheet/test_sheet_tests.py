@@ -15,6 +15,7 @@ from calibration.sheet.sheet_tests import (
     nominal_stress,
     r_squared,
 )
+from model.material.ogden import Ogden
 from rig.importing.sheet_table import read_sheet_tests
 
 # Published test data, kept beside the project; without it the tests on it are skipped.
@@ -115,7 +116,7 @@ def test_known_terms_are_recovered_within_their_stated_uncertainty() -> None:
 
 
 def test_analytic_jacobian_against_finite_differences(treloar: list[HomogeneousTest]) -> None:
-    problem = _TestsProblem(treloar, 3, "balanced")
+    problem = _TestsProblem(treloar, Ogden, 3, "balanced")
     x = np.array([0.02, 0.9, 0.1, -1.7, 1.4, 4.6])
     jacobian = problem.jacobian(x)
     for k in range(6):
