@@ -9,6 +9,8 @@ import click
 
 from rig.cli.files import FILE
 
+MOST_ROWS = 200  # of the table; of a longer plan the beginning and the end are shown
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -22,8 +24,11 @@ def command(scene: Path, protocol: Path) -> None:
     """Validate SCENE and PROTOCOL and print the plan with what the model predicts. Touches no hardware."""
     from rig.cli.show import show
     from rig.protocol.experiment import prepare
+    from rig.run.rehearse import check_instruments
 
-    show(plan_table(prepare(scene, protocol)))
+    experiment = prepare(scene, protocol)
+    check_instruments(experiment)
+    show(plan_table(experiment))
 
 
 def plan_table(experiment: Experiment) -> Table:
@@ -49,7 +54,12 @@ def plan_table(experiment: Experiment) -> Table:
     if scene.hv is not None:
         table.add_column("peak field / V/um", justify="right")
         table.add_column("tension margin / kPa", justify="right")
-    for action, prediction in zip(experiment.actions, experiment.predictions, strict=True):
+    left_out = len(experiment.actions) - MOST_ROWS
+    for number, (action, prediction) in enumerate(zip(experiment.actions, experiment.predictions, strict=True)):
+        if left_out > 0 and MOST_ROWS // 2 <= number < MOST_ROWS // 2 + left_out:
+            if number == MOST_ROWS // 2:
+                table.add_row("...", f"{left_out} more, which hold too", "...")
+            continue
         row = [str(action.step), f"{action.kind}: {action.label}", f"{action.duration:.1f}"]
         if action.record or action.moves or action.voltage[0] != action.voltage[1]:
             row.append(f"{prediction.peak_force:.3f}")

@@ -127,9 +127,7 @@ class Engine:
         status, reason = "complete", "the protocol ended"
         error: Exception | None = None
         try:
-            self.bench.attach(self.recorder.wire)
-            self._appoint_guard()
-            self._set_up()
+            self.set_up()
             self._watch = Watch(self.bench, self.recorder, self.limits, self.guard)
             self.rig.on_readings = self._watch.learn
             if self.rig.highest_voltage > 0 and not self._hands_come_first():
@@ -196,8 +194,17 @@ class Engine:
         if not scene.hv.measures_current:
             self.recorder.event("warning", "hv", "this supply does not measure its current: nothing watches it")
 
-    def _set_up(self) -> None:
-        """Poll until every driver has finished its set-up dialogue; then check who answered, and that HV is off."""
+    def set_up(self) -> None:
+        """Put the drivers to work and poll until each has finished its set-up dialogue; then check who answered, what
+        the plan needs of them, and that HV is off. Nothing has been moved and no output changed by then.
+
+        Raises
+        ------
+        RigError, DeviceError
+            What does not fit, or does not answer.
+        """
+        self.bench.attach(self.recorder.wire)
+        self._appoint_guard()
         devices = self.bench.devices
         end = self.clock.now() + SETUP_LIMIT_S
         while not all(device.ready for device in devices.values()):

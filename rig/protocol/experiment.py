@@ -15,6 +15,8 @@ from rig.protocol.protocol import Protocol, load_protocol
 from rig.scene.scene import Scene, load_scene
 from rig.steps.base import Action
 
+TIMES_BREAKDOWN = 10.0  # a limit of the field this far above breakdown is a slip of the unit
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -58,8 +60,10 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
     protocol, protocol_text = load_protocol(protocol_path)
     certificates = certificates_of(scene, scene_path)
     actions = plan(protocol, scene)
-    predictions = check_plan(actions, scene)
+    force = certificates.get("force")
+    predictions = check_plan(actions, scene, 0.0 if force is None else force.noise)
     _check_ranges(certificates, actions, predictions)
+    _check_limits(scene, scene_path, certificates, actions)
     return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions)
 
 
@@ -93,6 +97,28 @@ def _check_ranges(certificates: dict[str, Certificate], actions: list[Action], p
                     f"Step {action.step} ({action.kind}, {action.label}): {value:.4g} {unit} are expected, and "
                     f"{used.name} is calibrated up to {used.high:.4g} {unit} only. Calibrate further, or ask for less."
                 )
+
+
+def _check_limits(scene: Scene, path: Path, certificates: dict[str, Certificate], actions: list[Action]) -> None:
+    """Limits that protect nothing are refused, unless the scene accepts them by name; calibrations may go further."""
+    found: dict[str, str] = {}
+    force, most = certificates.get("force"), scene.limits.force_N
+    if force is not None and not most <= force.high and not any(action.by.calibrates for action in actions):
+        found["limits.force_N"] = f"{most:g} N, but {force.name} is calibrated up to {force.high:g} N only"
+    field, breakdown = scene.limits.field_V_per_um, scene.specimen.specimen().material.breakdown_field
+    if field is not None and breakdown is not None and not field <= TIMES_BREAKDOWN * breakdown * 1e-6:
+        found["limits.field_V_per_um"] = (
+            f"{field:g} V/um, more than {TIMES_BREAKDOWN:g} times the material's breakdown field of "
+            f"{breakdown * 1e-6:g} V/um"
+        )
+    refused = {key: words for key, words in found.items() if key not in scene.accept}
+    if refused:
+        lines = "\n".join(f"  {key} = {words}." for key, words in refused.items())
+        names = ", ".join(f'"{name}"' for name in [*scene.accept, *refused])
+        raise ConfigError(
+            f"{path}: limits that protect nothing.\n{lines}\n"
+            f"  If they are meant, put this line above the first table of the file: accept = [{names}]"
+        )
 
 
 def gains_of(certificates: dict[str, Certificate]) -> Gains:

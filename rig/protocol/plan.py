@@ -15,6 +15,9 @@ from rig.steps.base import Action, OnResume, State, Step
 from rig.steps.prompt import ask_first
 from rig.steps.regain import Regain
 
+MOST_ACTIONS = 50_000  # a protocol of more is a slip: so many moves take days
+LONGEST_S = 90 * 86_400.0
+
 
 def plan(protocol: Protocol, scene: Scene) -> list[Action]:
     """All actions of ``protocol`` on ``scene``, in order.
@@ -24,6 +27,8 @@ def plan(protocol: Protocol, scene: Scene) -> list[Action]:
     LimitError
         When the protocol needs what the scene does not have (a voltage without ``[hv]``), or asks for steps in an
         order that cannot work. Numerical limits are checked by `rig.protocol.predict.check_plan`.
+    ConfigError
+        When it would take more actions, or more time, than can be meant.
     """
     return list(_actions(enumerate(protocol.step, start=1), scene))
 
@@ -79,6 +84,7 @@ def _again(done: list[tuple[int, Step]], skipped: Collection[int]) -> dict[int, 
 
 def _actions(numbered: Iterable[tuple[int, Step]], scene: Scene) -> Iterator[Action]:
     state = State()
+    count, seconds = 0, 0.0
     for number, step in numbered:
         state.number = number
         where, highest = step.where(number), step.highest_voltage
@@ -86,4 +92,16 @@ def _actions(numbered: Iterable[tuple[int, Step]], scene: Scene) -> Iterator[Act
             raise LimitError(f"{where} asks for {highest:g} V, but the scene has no [hv] instrument.")
         if step.needs_contact and not state.contact:
             raise LimitError(f"{where} needs the contact position: put an approach step before it.")
-        yield from step.plan(state, scene)
+        for action in step.plan(state, scene):
+            count, seconds = count + 1, seconds + action.duration
+            if count > MOST_ACTIONS:
+                raise ConfigError(
+                    f"{where}: up to here the protocol has more than {MOST_ACTIONS} actions (moves, ramps, holds); "
+                    "that can hardly be meant. Ask for fewer cycles or voltages, or split it into several runs."
+                )
+            if not seconds <= LONGEST_S:
+                raise ConfigError(
+                    f"{where}: up to here the protocol takes {seconds / 86_400:.3g} days; at most "
+                    f"{LONGEST_S / 86_400:.0f} are allowed. Is a speed too small, or a duration too long?"
+                )
+            yield action

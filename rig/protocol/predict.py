@@ -51,8 +51,10 @@ def _stored_energy(specimen: Specimen, h: float, voltage: float, beside: float) 
     return 0.5 * (state.capacitance() + beside) * voltage**2 if state.answered else math.nan
 
 
-def check_plan(actions: Sequence[Action], scene: Scene) -> list[Prediction]:
+def check_plan(actions: Sequence[Action], scene: Scene, force_noise: float = 0.0) -> list[Prediction]:
     """Predict every action and hold it against the scene's limits.
+
+    ``force_noise`` is the standard deviation of one force sample (N), by the certificate.
 
     Raises
     ------
@@ -65,6 +67,7 @@ def check_plan(actions: Sequence[Action], scene: Scene) -> list[Prediction]:
     known: dict[object, Prediction] = {}  # a cycle is predicted once
     for action in actions:
         where = f"Step {action.step} ({action.kind}, {action.label})"
+        action.check(specimen, limits, force_noise)
         limits.displacement.check(max(action.h), where)
         limits.speed.check(action.speed, where)
         for level in action.voltage:

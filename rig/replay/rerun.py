@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from rig.bench.bench import Bench
 from rig.bench.opening import open_memory
 from rig.engine.engine import Engine
 from rig.engine.outcome import Outcome
+from rig.log.nowhere import NoLog
 from rig.operator.control import Answer, Control, Question
 from rig.protocol.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench
@@ -83,7 +83,7 @@ def rerun(recording: Recording, *, steered: bool | None = None) -> Rerun:
     experiment = recording.experiment
     operator = _Operator(recording)
     replay = _Again(recording, operator)
-    log = _NoLog()
+    log = NoLog()
     bench: Bench
     if steered:
         bench = SteeredBench(experiment.scene, replay, recording)
@@ -189,19 +189,3 @@ class _Again(ReplayBench):
     def advance(self, t: float) -> None:
         super().advance(t)
         self._operator.at(t)
-
-
-class _NoLog:
-    """Takes the place of a log that nobody needs; ``listener`` is told every row."""
-
-    def __init__(self) -> None:
-        self.listener: Callable[[str, Mapping[str, Any]], None] = lambda topic, fields: None
-
-    def write(self, topic: str, fields: Mapping[str, Any], log_ns: int, publish_ns: int) -> None:
-        self.listener(topic, fields)
-
-    def metadata(self, name: str, mapping: dict[str, str]) -> None:
-        """Nothing is kept."""
-
-    def tick(self, now: float) -> None:
-        """Nothing is due."""

@@ -62,6 +62,7 @@ def prepare_resumed(
         f"Going on at step {first} of {len(protocol.step)}. Is specimen {scene.specimen.name} still mounted as the run "
         f"of {ended} left it, and nothing in the way of the stage, which finds its reference position first?"
     )
+    certificates = _certificates(log)
     actions = plan_resumed(protocol, scene, first, still_valid, question)
     plan(protocol, scene)  # what is left must belong to a protocol that can be carried out
     return Experiment(
@@ -69,9 +70,9 @@ def prepare_resumed(
         scene_text,
         protocol,
         protocol_text,
-        _certificates(log),
+        certificates,
         actions,
-        check_plan(actions, scene),
+        check_plan(actions, scene, certificates["force"].noise),
         resumed={
             "log": path.name,
             "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),

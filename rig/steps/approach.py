@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.roles import ForceSample, Sample, Stage, StageSample
+from model.membrane.solve import solve
+from model.specimen import Specimen
 from rig.base.errors import FaultError, LimitError
+from rig.safety.limits import Limits
 from rig.scene.scene import Scene
 from rig.steps.base import Action, OnResume, Positive, State, Step, Turns, allowed
 from rig.steps.rig import Rig
@@ -73,6 +76,7 @@ class Approach(Step):
             start=start,
             fast=fast,
             max_travel=travel,
+            force_rate=scene.rates["force"],
         )
 
 
@@ -93,12 +97,32 @@ class Approaching(Action):
         m of the stage: where approaching begins, and how far it goes on at most.
     fast : float
         m/s, on the way to the start.
+    force_rate : float
+        Force samples per second that the scene asks for.
     """
 
     threshold: float
     start: float
     fast: float
     max_travel: float
+    force_rate: float
+
+    def check(self, specimen: Specimen, limits: Limits, force_noise: float) -> None:
+        """The threshold lies above the noise, and below what the film gives within the limits."""
+        where = f"Step {self.step} (approach): threshold_mN = {self.threshold * 1e3:g}"
+        needed = least_threshold(force_noise, samples_averaged(self.force_rate))
+        if not self.threshold >= needed:
+            raise LimitError(
+                f"{where} is lost in the force noise of the certificate; give at least {needed * 1e3:.2g}."
+            )
+        if not self.threshold < limits.force.high:
+            raise LimitError(f"{where} is not below limits.force_N = {limits.force.high:g}: contact would not be felt.")
+        at_limit = solve(specimen, limits.displacement.high, 0.0)
+        if at_limit.answered and not self.threshold < at_limit.force:
+            raise LimitError(
+                f"{where}: by the model the film gives {at_limit.force * 1e3:.3g} mN at limits.displacement_mm = "
+                f"{limits.displacement.high * 1e3:g}. It would be pushed beyond that before contact is felt."
+            )
 
     def carry_out(self, rig: Rig) -> Turns:
         n = samples_averaged(rig.bench.force.rate)

@@ -16,7 +16,9 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
+from model.specimen import Specimen
 from rig.base.table import Table
+from rig.safety.limits import Limits
 from rig.scene.scene import Scene
 from rig.steps.rig import Rig
 
@@ -168,6 +170,19 @@ class Action(ABC):
     def allowed_s(self) -> float:
         """How long its way may take before that is a fault."""
         return allowed(self.duration)
+
+    def check(self, specimen: Specimen, limits: Limits, force_noise: float) -> None:  # noqa: B027 # most have nothing
+        """Refuse before anything moves what only this kind of action knows; nothing by default.
+
+        Parameters
+        ----------
+        force_noise : float
+            Standard deviation (N) of one force sample by the sensor's certificate; 0 where there is none.
+
+        Raises
+        ------
+        LimitError
+        """
 
     @abstractmethod
     def carry_out(self, rig: Rig) -> Turns:
