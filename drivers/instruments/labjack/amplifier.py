@@ -153,7 +153,7 @@ class LabJackAmplifier:
         self._limit = math.inf  # A
         self._over_limit = 0
         self._wanted = self._setpoint = 0.0  # V of the output
-        self._measured = math.nan
+        self._measured = self._dac_volts = math.nan
         self._proven = False
         self._stepped_at: float | None = None
         self._lags_since: float | None = None
@@ -357,7 +357,7 @@ class LabJackAmplifier:
         a = self._amplifier
         voltage = volts * a.voltage_monitor_V_per_V * a.polarity
         current = amperes * a.current_monitor_uA_per_V * 1e-6 * a.polarity
-        self._measured = voltage
+        self._measured, self._dac_volts = voltage, dac
         self._judge(volts, amperes, current)
         read_back = self._volts(dac)
         as_asked = abs(read_back - self._setpoint) <= self._least_step
@@ -394,6 +394,8 @@ class LabJackAmplifier:
         if self._stepped_at is None:
             self._stepped_at = self._now
             return
+        if self._target > self._setpoint:
+            self._check_dac(self._dac_volts)
         if self._is_behind(self._measured):
             return
         elapsed = min(self._now - self._stepped_at, LONGEST_STEP_S)
@@ -403,9 +405,19 @@ class LabJackAmplifier:
         self._stepped_at = self._now
         yield from self._write(self._setpoint + change)
 
+    def _check_dac(self, dac: float) -> None:
+        """Before the output is raised: the DAC must hold what was written."""
+        if abs(self._volts(dac) - self._setpoint) > self._least_step:
+            raise DeviceRefused(
+                self._label,
+                f"the DAC holds {dac:.4f} V, not the {self._setpoint / self._amplifier.gain_V_per_V:.4f} V written",
+                "Its watchdog has acted, or another program writes to it.",
+            )
+
     def _is_behind(self, voltage: float) -> bool:
         """Whether the output lags behind the set-point: the ramp waits, for a while."""
-        behind = abs(self._setpoint - voltage) > max(LAG_V, LAG_PART * self._setpoint)
+        allowed = max(LAG_V, (LAG_PART + self._tolerance) * self._setpoint)
+        behind = abs(self._setpoint - voltage) > allowed
         if not behind:
             self._lags_since = None
             return False
@@ -423,13 +435,8 @@ class LabJackAmplifier:
 
     def _write(self, volts: float) -> Part[None]:
         """Set the DAC and read it back: it is clamped without a word, and set to 0 by the watchdog."""
-        dac = yield from self._registers.number(self._dac_register)
-        if volts > self._setpoint and abs(self._volts(dac) - self._setpoint) > self._least_step:
-            raise DeviceRefused(
-                self._label,
-                f"the DAC holds {dac:.4f} V, not the {self._setpoint / self._amplifier.gain_V_per_V:.4f} V written",
-                "Its watchdog has acted, or another program writes to it.",
-            )
+        if volts > self._setpoint:
+            self._check_dac((yield from self._registers.number(self._dac_register)))
         wanted = volts / self._amplifier.gain_V_per_V
         yield from self._registers.write(self._dac_register, f32(wanted))
         dac = yield from self._registers.number(self._dac_register)
