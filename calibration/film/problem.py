@@ -134,7 +134,7 @@ class Problem:
         self.names += at.law.names(self.moduli, shapes)[self.moduli :]
         self.names += ["eps_r"] if self.electric else []
         self.film_parameters = len(self.names)
-        self.names += [f"{nuisance.kind}_{k}" for k, nuisance in enumerate(self.nuisances)]
+        self.names += [f"{nuisance.kind.replace('-', '_')}_{k}" for k, nuisance in enumerate(self.nuisances)]
 
         self._give = np.zeros_like(self.nodes)  # force (N) by which the rig gives way at the nodes
         x = np.zeros(len(self.names))

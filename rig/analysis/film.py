@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.film.cards import CardError, material_cards
 from calibration.film.curve import Curve, CurveError
 from calibration.film.identify import IdentificationError, compare, identify
 from calibration.film.result import Identification
@@ -63,13 +64,15 @@ def identify_logs(
     wrinkled: str = "left-out",
     posterior: bool = False,
     progress: Callable[[float, float, str], None] = lambda done, total, label: None,
+    **settings: Any,
 ) -> Found:
     """Identify the film from all recorded curves of all logs at once.
 
     ``law`` is the name of the law to fit, the scene's when not given. ``comparing`` judges 1, 2 and 3 Ogden terms
     beside each other, ``profiles`` adds 95 % intervals from profile likelihood; each takes a few seconds more.
     ``posterior`` adds Markov chains, which take a minute or more and tell ``progress``. ``wrinkled`` is "left-out" or
-    "tension-field".
+    "tension-field". Other ``settings`` are those of `calibration.film.identify.identify`: ``fixed``,
+    ``negative_exponents``, ``along``, ``fixed_stretch``.
 
     Raises
     ------
@@ -109,6 +112,7 @@ def identify_logs(
         progress=progress,
         law=scenes[0].specimen.specimen().material.law if law is None else law_called(law),
         reach=min(scene.limits.displacement_mm for scene in scenes) * 1e-3,
+        **settings,
     )
     return replace(identified, runs=runs, truth=_truth(runs, scenes), notes=_notes(runs))
 
@@ -125,6 +129,7 @@ def identify_curves(
     progress: Callable[[float, float, str], None] = lambda done, total, label: None,
     law: type[Law] | None = None,
     reach: float = math.inf,
+    **settings: Any,
 ) -> Found:
     """Identify the film from curves, wherever they come from; options as in `identify_logs`.
 
@@ -141,6 +146,7 @@ def identify_curves(
         "wrinkling": "tension_field" if wrinkled == "tension-field" else "plain",
         "reach": reach,
         "law": law or curves[0].specimen.material.law,
+        **settings,
     }
     counts = (1, 2, 3) if options["law"].series else (1,)
     terms = min(terms, counts[-1])
@@ -265,6 +271,33 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
             )
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None
+
+
+def write_cards(found: Identification, folder: Path) -> list[Path]:
+    """Write the material cards of every program that knows the law into ``folder``, which is made if need be.
+
+    Raises
+    ------
+    ConfigError
+        When a file cannot be written, or is there already.
+    DataError
+        When no program has the law.
+    """
+    try:
+        cards = material_cards(found.material)
+    except CardError as error:
+        raise DataError(f"{error}.") from None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made: {error.strerror}.") from None
+    paths = [folder / name for name in cards]
+    there = [str(path) for path in paths if path.exists()]
+    if there:
+        raise ConfigError(f"{', '.join(there)}: there already; nothing was overwritten. Name another folder.")
+    for path, text in zip(paths, cards.values(), strict=True):
+        write_text(path, text)
+    return paths
 
 
 def _with_drift(curve: Curve, certificates: Mapping[str, Certificate]) -> Curve:

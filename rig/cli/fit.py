@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from calibration.film.result import Identification
+
+
+LEAST_SHARE = 0.01  # of a variance, for a line in the budget on screen
 
 
 @click.command("fit")
@@ -36,6 +40,16 @@ if TYPE_CHECKING:
     show_default=True,
     help="Samples at which the film is wrinkled: leave out, or describe by the tension field. Counted either way.",
 )
+@click.option("--fix", "fixed", multiple=True, help="Hold a parameter: eps_r=2.8, alpha1=2. May be repeated.")
+@click.option("--negative-exponents", is_flag=True, help="Let a term have alpha < 0 and mu < 0 as well.")
+@click.option(
+    "--along",
+    multiple=True,
+    type=click.Choice(["eps-stretch", "softening", "voltage-loss", "zero-drift"]),
+    help="An error to be fitted along within its usual size. May be repeated.",
+)
+@click.option("--stiffness-at", help="Stretches of the stiffness that can be compared between runs, e.g. 1.5,1.2.")
+@click.option("--cards", type=FILE, help="Folder for material cards of Abaqus, Ansys, COMSOL and FEBio.")
 @import_options(cone=True)
 def command(
     logs: tuple[Path, ...],
@@ -48,6 +62,11 @@ def command(
     profiles: bool,
     posterior: bool,
     wrinkled: str,
+    fixed: tuple[str, ...],
+    negative_exponents: bool,
+    along: tuple[str, ...],
+    stiffness_at: str | None,
+    cards: Path | None,
     dry_run: bool,
     tidy: Path | None,
     **words: Any,
@@ -58,7 +77,7 @@ def command(
     voltage, in any encoding, separator and decimal sign. What is understood of a table is printed first; what cannot be
     understood is asked for, with the option that tells it.
     """
-    from rig.analysis.film import identify_logs, write_results
+    from rig.analysis.film import identify_logs, write_cards, write_results
     from rig.base.outputs import check_new
     from rig.base.progress import progress
     from rig.cli.show import show
@@ -87,16 +106,51 @@ def command(
             "wrinkled": wrinkled,
             "posterior": posterior,
             "progress": update,
+            "fixed": _fixed(fixed),
+            "negative_exponents": negative_exponents,
+            "along": along,
+            "fixed_stretch": _stretches(stiffness_at),
         }
         if tables is not None and scene is not None:
             found = identify_cones(tables, logs, scene, **settings)
         else:
             found = identify_logs(list(logs), **settings)
     write_results(found, out, report)
+    written = [] if cards is None else write_cards(found.identification, cards)
     parts = [comparison_table(found.comparison)] if comparing else []
     parts += [posterior_table(found.identification)] if posterior else []
     show(identification_table(found.identification), *parts, *(f"note: {note}" for note in found.notes))
-    tell_written(out, report, tidy)
+    tell_written(out, report, tidy, *written)
+
+
+def _fixed(words: Sequence[str]) -> dict[str, float]:
+    """Parameters to be held, from ``name=value``."""
+    found = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            raise click.BadParameter(f"{word!r}: write name=value, as in eps_r=2.8", param_hint="--fix") from None
+        if not math.isfinite(found[name.strip()]):
+            raise click.BadParameter(f"{word!r}: the value is not a number", param_hint="--fix")
+    return found
+
+
+def _stretches(words: str | None) -> tuple[float, float] | None:
+    """Meridional and hoop stretch, from two numbers with a comma."""
+    if words is None:
+        return None
+    try:
+        meridional, hoop = (float(word) for word in words.split(","))
+    except ValueError:
+        meridional = hoop = math.nan
+    if not 1.0 <= hoop <= meridional < 20.0 or meridional == 1.0:
+        raise click.BadParameter(
+            f"{words!r}: write the meridional and the hoop stretch, as in 1.5,1.2; the first is the larger one",
+            param_hint="--stiffness-at",
+        )
+    return meridional, hoop
 
 
 def _check_source(paths: Sequence[Path], scene: Path | None, about_tables: bool) -> None:
@@ -135,6 +189,11 @@ def identification_table(found: Identification) -> Group:
         f"secant shear modulus at stretches {found.stretch[0]:.2f} (meridional; largest "
         f"{found.stiffness_curve.meridional_stretch[-1]:.2f}) and {found.stretch[1]:.2f} (hoop).",
     ]
+    lines.append(
+        f"stiffness (fixed) belongs to stretches {found.fixed_stretch[0]:.2f} and {found.fixed_stretch[1]:.2f}, "
+        "whatever the data determine best: compare it between runs."
+    )
+    lines += [budget_table(found), *_given_dimensions(found), *_measurement(found), *_along(found)]
     lines += [f"note: {warning}" for warning in found.warnings]
     lines += [f"advice: {advice}" for advice in found.advice]
     if found.blind_spots:
@@ -151,6 +210,90 @@ def identification_table(found: Identification) -> Group:
             "more than its uncertainty."
         )
     return Group(*lines)
+
+
+def budget_table(found: Identification) -> Table:
+    """Where the uncertainties come from: parts that make up a hundredth of a variance or more."""
+    from rich.table import Table
+
+    from calibration.rounding import percent
+    from rig.cli.show import NAMES
+
+    names = [name for name in ("stiffness", "eps_r") if name in found.quantities]
+    shown = [found.quantities[name] for name in names]
+    table = Table(title="Budget: standard uncertainty, and share of the variance")
+    table.add_column("part", overflow="fold")
+    for name in names:
+        table.add_column(NAMES.get(name, name), justify="right")
+    parts = list(dict.fromkeys(part for quantity in shown for part in quantity.budget))
+    parts.sort(key=lambda part: -max(quantity.share(part) for quantity in shown))
+    for part in parts:
+        if max(quantity.share(part) for quantity in shown) < LEAST_SHARE:
+            continue
+        assumed = f" (assumed, not stated: {percent(found.assumed[part])})" if part in found.assumed else ""
+        cells = (
+            f"{percent(quantity.budget.get(part, 0.0) / abs(quantity.value))} ({quantity.share(part):.0%})"
+            for quantity in shown
+        )
+        table.add_row(part + assumed, *cells)
+    return table
+
+
+def _given_dimensions(found: Identification) -> list[str]:
+    """The conditional figures, and what took a verdict away."""
+    from calibration.rounding import percent
+    from rig.cli.show import NAMES
+
+    names = [name for name in ("stiffness", "eps_r") if name in found.quantities]
+    shown = {NAMES.get(name, name): found.quantities[name] for name in names}
+    words = ", ".join(
+        f"{label} +- {percent(one.conditional / abs(one.value))} ({one.conditional_verdict})"
+        for label, one in shown.items()
+    )
+    lines = [f"given the dimensions, as if those of the specimens were exact: {words}."]
+    lines += [f"{label} does not count as identified: {one.doubt}." for label, one in shown.items() if one.doubt]
+    return lines
+
+
+def _along(found: Identification) -> list[str]:
+    """What was fitted along on request, how well it is determined, and what it did to the results."""
+    from calibration.film.result import SHOWN
+    from calibration.rounding import rounded
+    from rig.cli.show import NAMES
+
+    lines = []
+    for name, shifts in found.along.items():
+        one = found.nuisance[name]
+        factor, unit = SHOWN[one.unit]
+        size, error = rounded(one.value * factor, one.uncertainty * factor)
+        moved = ", ".join(
+            f"{NAMES.get(key, key)} by {100.0 * shift / found.quantities[key].value:+.2g} %"
+            for key, shift in shifts.items()
+        )
+        known = "" if one.uncertainty < 0.5 * one.prior else "; these data hardly determine it"
+        lines.append(
+            f"fitted along: {name}: {size} +- {error} {unit} (allowed +- {one.prior * factor:.2g} {unit}{known}); "
+            f"it moved {moved}."
+        )
+    return lines
+
+
+def _measurement(found: Identification) -> list[str]:
+    """What to measure next."""
+    from calibration.rounding import percent
+    from rig.cli.show import NAMES
+
+    best = found.measurement
+    if best is None:
+        return []
+    gains = ", ".join(
+        f"{NAMES.get(name, name)} from {percent(now)} to {percent(then)}" for name, (now, then) in best.relative.items()
+    )
+    known = "assumed" if best.assumed else "stated"
+    return [
+        f"the one measurement that would help most: the {best.part}, to {percent(best.then)} ({known} now: "
+        f"{percent(best.now)}). It would bring {gains}."
+    ]
 
 
 def comparison_table(found: Sequence[Identification]) -> Table:

@@ -19,6 +19,7 @@ NAMES = {
     "eps_r": "permittivity",
     "stiffness": "stiffness (best)",
     "stiffness_end": "stiffness (end)",
+    "stiffness_fixed": "stiffness (fixed)",
     "G": "shear modulus",
 }
 

@@ -19,6 +19,7 @@ from model.material.materials import Material
 # A quantity of the result: base of its name -> symbol, subscript, meaning.
 _SHOWN = {
     "stiffness": ("G", "s", "stiffness: secant shear modulus where the data determine it best"),
+    "stiffness_fixed": ("G", "fix", "secant shear modulus at fixed stretches, to be compared between runs"),
     "stiffness_end": ("G", "end", "secant shear modulus at the largest stretch"),
     "eps_r": ("ε", "r", "relative permittivity"),
     "G": ("G", "", "small-strain shear modulus"),
@@ -40,6 +41,9 @@ class Row:
     uncertainty: str
     relative: str
     interval: str
+    conditional: str  # relative uncertainty given the dimensions
+    conditional_verdict: str
+    doubt: str
     verdict: str
     badge: str
     truth: str
@@ -84,6 +88,7 @@ class ReportData:
             "G": truth.shear_modulus,
             "eps_r": truth.eps_r,
             "stiffness": secant_modulus(truth, *found.stretch),
+            "stiffness_fixed": secant_modulus(truth, *found.fixed_stretch),
             "stiffness_end": secant_modulus(truth, found.stiffness_curve.meridional_stretch[-1], found.stretch[1]),
         }
         if (truth.law, truth.terms) == (found.material.law, found.terms):
@@ -120,6 +125,9 @@ class ReportData:
             uncertainty=uncertainty,
             relative=percent(quantity.relative),
             interval=f"{low} to {high}",
+            conditional=percent(quantity.conditional / abs(quantity.value)) if quantity.value else "–",
+            conditional_verdict=quantity.conditional_verdict,
+            doubt=quantity.doubt,
             verdict=quantity.verdict + (" (at the edge of its range)" if quantity.at_bound else ""),
             badge=BADGES.get(quantity.verdict, "bad"),
             truth="" if truth is None else f"{truth * factor:.6g} {unit}".strip(),

@@ -18,20 +18,24 @@ def context(data: ReportData) -> Mapping[str, Any]:
     parts = list(dict.fromkeys(part for quantity in quantities.values() for part in quantity.budget))
     rows: list[list[Any]] = []
     for part in parts:
-        sizes = (
-            one.budget[part] / abs(one.value) if part in one.budget and one.value else None
-            for one in quantities.values()
-        )
-        rows.append([part, *("–" if size is None else percent(size) for size in sizes)])
+        rows.append([_label(data, part), *(_share(quantity, part) for quantity in quantities.values())])
     rows.append([Markup("<b>combined</b>"), *(Markup("<b>{}</b>").format(row.relative) for row in data.rows.values())])
     headings = ["part", *(Markup(">{}").format(symbol(name)) for name in quantities)]
-    caption = "Uncertainty budget: standard uncertainties relative to the value; they add in squares"
+    caption = "Uncertainty budget: relative standard uncertainties, which add in squares (share of the variance)"
     return {"budget": Table(headings, rows, caption)}
 
 
+def _label(data: ReportData, part: str) -> str:
+    """The part, and what was assumed of it where nobody stated it."""
+    assumed = data.identification.assumed
+    return f"{part} (assumed, not stated: {percent(assumed[part])})" if part in assumed else part
+
+
 def _share(quantity: Quantity, part: str) -> str:
-    """A part of the budget relative to the value."""
-    return percent(quantity.budget[part] / abs(quantity.value)) if part in quantity.budget and quantity.value else "–"
+    """A part of the budget relative to the value, and its share of the variance."""
+    if part not in quantity.budget or not quantity.value:
+        return "–"
+    return f"{percent(quantity.budget[part] / abs(quantity.value))} ({quantity.share(part):.0%})"
 
 
 SECTION = Section("budget", 50, context, "{{ table(budget) }}")

@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from calibration.film.result import Measurement
 from calibration.report.sections.base import ReportData, Section
+from calibration.rounding import percent
 
 HEADLINE = ("stiffness", "eps_r", "G")
 
@@ -14,12 +16,20 @@ HEADLINE = ("stiffness", "eps_r", "G")
 def context(data: ReportData) -> Mapping[str, Any]:
     """The quantities that come first."""
     fit = data.identification
+    best = fit.measurement
     return {
         "fit": fit,
         "specimens": data.specimens,
         "headline": {name: data.rows[name] for name in HEADLINE if name in data.rows},
+        "measurement": None if best is None else _measurement(best),
         "misfit": math.sqrt(fit.lack_of_fit / fit.lack_of_fit_freedom),
     }
+
+
+def _measurement(best: Measurement) -> dict[str, Any]:
+    """The most useful measurement as text."""
+    gains = [(name, percent(now), percent(then)) for name, (now, then) in best.relative.items()]
+    return {"now": percent(best.now), "then": percent(best.then), "gains": gains}
 
 
 TEMPLATE = """
@@ -34,6 +44,9 @@ TEMPLATE = """
 {% if row.truth %}<br>truth of the simulation {{ row.truth }} (off by {{ row.deviation }} standard uncertainties){%
 endif %}</div>
 <div class="badge {{ row.badge }}">{{ row.verdict }}</div>
+{% if row.doubt %}<div class="what">Not identified, because {{ row.doubt }}.</div>{% endif %}
+<div class="what">Given the dimensions, as if those of the specimens were exact: ± {{ row.conditional }},
+{{ row.conditional_verdict }}.</div>
 </div>
 {% endfor %}
 </div>
@@ -47,6 +60,13 @@ Against curves
 that are merely smooth, the model leaves {{ "%.2f" | format(misfit) }} times the misfit that noise alone would
 ({{ fit.lack_of_fit_freedom }} degrees of freedom, probability {{ "%.2g" | format(fit.lack_of_fit_probability)
 }}).</p>
+{% if measurement %}
+<p>The one measurement that would help most: the {{ fit.measurement.part }}, to {{ measurement.then }}
+({{ "assumed, not stated" if fit.measurement.assumed else "stated" }} now: {{ measurement.now }}). It would bring
+{% for name, now, then in measurement.gains %}
+{{ symbol(name) }} from {{ now }} to {{ then }}{{ "," if not loop.last else "." }}
+{% endfor %}</p>
+{% endif %}
 {% if fit.warnings or fit.advice %}
 <ul class="notes">
 {% for warning in fit.warnings %}
