@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.film.between import Spread, between, by_specimen, identify_each
 from calibration.film.cards import CardError, material_cards
 from calibration.film.curve import Curve, CurveError
 from calibration.film.identify import IdentificationError, compare, identify
@@ -51,6 +52,7 @@ class Found:
     truth: Material | None
     notes: list[str]
     comparison: list[Identification] = field(default_factory=list)
+    spreads: dict[str, Spread] = field(default_factory=dict)
     scene_texts: dict[str, str] = field(default_factory=dict)  # beside those of the runs: scenes given with tables
 
 
@@ -114,7 +116,7 @@ def identify_logs(
         reach=min(scene.limits.displacement_mm for scene in scenes) * 1e-3,
         **settings,
     )
-    return replace(identified, runs=runs, truth=_truth(runs, scenes), notes=_notes(runs))
+    return replace(identified, runs=runs, truth=_truth(runs, scenes), notes=[*_notes(runs), *identified.notes])
 
 
 def identify_curves(
@@ -129,11 +131,13 @@ def identify_curves(
     progress: Callable[[float, float, str], None] = lambda done, total, label: None,
     law: type[Law] | None = None,
     reach: float = math.inf,
+    each: bool = False,
     **settings: Any,
 ) -> Found:
     """Identify the film from curves, wherever they come from; options as in `identify_logs`.
 
     ``law`` is that of the specimens' material when not given.
+    With ``each`` every specimen is fitted alone as well, and what scatters between them is told.
 
     Raises
     ------
@@ -160,7 +164,18 @@ def identify_curves(
             identification = replace(identification, posterior=sample(curves, identification, progress=progress))
     except (CurveError, IdentificationError) as error:
         raise DataError(f"{error}.") from None
-    return Found(identification, curves, [], provenance, None, [], comparison)
+    found = Found(identification, curves, [], provenance, None, [], comparison)
+    return replace(found, **_between(curves, terms, options)) if each else found
+
+
+def _between(curves: list[Curve], terms: int, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Statistics between specimens, where there are several, and notes on those that could not be fitted alone."""
+    if len(by_specimen(curves)) < 2:
+        return {}
+    each, failed = identify_each(curves, terms=terms, starts=2, **(dict(options) | {"profiles": False}))
+    one_batch = len({curve.batch for curve in curves}) == 1 and curves[0].batch != ""
+    notes = [f"not fitted alone: {why}" for why in failed]
+    return {"spreads": between(each, one_batch), "notes": notes}
 
 
 def law_called(name: str) -> type[Law]:
@@ -221,7 +236,7 @@ def _notes(runs: Sequence[Run]) -> list[str]:
             if there and role not in run.certificates:
                 notes.append(
                     f"{log.path}: the {device} has no certificate; its readings are taken as they are, and the "
-                    f"uncertainties contain nothing of their errors. `dea-rig calibrate {role}` makes one"
+                    f"error of its gain is an assumption. `dea-rig calibrate {role}` makes one"
                 )
         if not log.whole:
             notes.append(f"{log.path} is cut short or damaged; `dea-rig info {log.path}` tells what is missing")

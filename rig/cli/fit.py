@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Group, RenderableType
     from rich.table import Table
 
+    from calibration.film.between import Spread
     from calibration.film.result import Identification
 
 
@@ -73,9 +74,10 @@ def command(
 ) -> None:
     """Identify the film's law and permittivity from all curves of LOGS at once, with uncertainties.
 
-    LOGS are logs of this program; or, with --scene, tables of another rig with columns of displacement, force and
-    voltage, in any encoding, separator and decimal sign. What is understood of a table is printed first; what cannot be
-    understood is asked for, with the option that tells it.
+    LOGS are logs of this program, or a folder of them, whose specimens are also fitted each alone and compared. With
+    --scene they are tables of another rig with columns of displacement, force and voltage, in any encoding, separator
+    and decimal sign. What is understood of a table is printed first; what cannot be understood is asked for, with the
+    option that tells it.
     """
     from rig.analysis.film import identify_logs, write_cards, write_results
     from rig.base.outputs import check_new
@@ -83,6 +85,8 @@ def command(
     from rig.cli.show import show
 
     check_new(out, report, tidy)
+    each = any(path.is_dir() for path in logs)
+    logs = _of_folders(logs)
     options = taken(words)
     _check_source(logs, scene, given(options) or dry_run or tidy is not None)
     tables = None
@@ -109,6 +113,7 @@ def command(
             "fixed": _fixed(fixed),
             "negative_exponents": negative_exponents,
             "along": along,
+            "each": each,
             "fixed_stretch": _stretches(stiffness_at),
         }
         if tables is not None and scene is not None:
@@ -119,8 +124,57 @@ def command(
     written = [] if cards is None else write_cards(found.identification, cards)
     parts = [comparison_table(found.comparison)] if comparing else []
     parts += [posterior_table(found.identification)] if posterior else []
+    if found.spreads:
+        parts.append(spread_table(found.spreads))
     show(identification_table(found.identification), *parts, *(f"note: {note}" for note in found.notes))
     tell_written(out, report, tidy, *written)
+
+
+def _of_folders(paths: Sequence[Path]) -> tuple[Path, ...]:
+    """The paths, with the logs of a folder in place of the folder. Raises `ConfigError` where it has none."""
+    from rig.base.errors import ConfigError
+
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        logs = sorted(path.rglob("*.mcap"))
+        if not logs:
+            raise ConfigError(f"{path}: there is no log (*.mcap) in this folder.")
+        found += logs
+    return tuple(found)
+
+
+def spread_table(spreads: Mapping[str, Spread]) -> Table:
+    """Each specimen alone, and what they have in common."""
+    from rich.table import Table
+
+    from calibration.rounding import rounded
+    from rig.cli.show import NAMES
+
+    table = Table(
+        title="Between specimens, each fitted alone (random effects)",
+        caption="After +-: each specimen's own standard uncertainty; of the mean, with what all share.",
+    )
+    table.add_column("specimen", overflow="fold")
+    factors = {name: (1e-3, " / kPa") if one.unit == "Pa" else (1.0, "") for name, one in spreads.items()}
+    for name, (_, unit) in factors.items():
+        table.add_column(NAMES.get(name, name) + unit, justify="right")
+    rows: dict[str, list[str]] = {}
+    for name, one in spreads.items():
+        factor = factors[name][0]
+        for who, value in one.values.items():
+            rows.setdefault(who, []).append(" +- ".join(rounded(value * factor, one.uncertainties[who] * factor)))
+        rows.setdefault("mean", []).append(" +- ".join(rounded(one.mean * factor, one.uncertainty * factor)))
+        for label, size in (("scatter between", one.between), ("scatter within", one.within), ("shared", one.shared)):
+            rows.setdefault(label, []).append(f"{size * factor:.2g}")
+        rows.setdefault("probability of no scatter between", []).append(f"{one.probability:.2g}")
+    last = ("mean", "scatter between", "scatter within", "shared", "probability of no scatter between")
+    for who in (*(one for one in rows if one not in last), *last):
+        if len(rows[who]) == len(spreads):
+            table.add_row(who, *rows[who])
+    return table
 
 
 def _fixed(words: Sequence[str]) -> dict[str, float]:

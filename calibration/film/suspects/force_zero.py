@@ -36,6 +36,6 @@ def _offset(context: Context) -> Sequence[Shape]:
 
 
 SUSPECTS = [
-    Kind(NAME, "N", 0, 5e-3, REMEDY, _drift, key="zero-drift"),
+    Kind(NAME, "N", 0, 10e-3, REMEDY, _drift, key="zero-drift"),
     Kind("zero of the force", "N", 0, 2e-3, "take the zero of the force before the run", _offset),
 ]

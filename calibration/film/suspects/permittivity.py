@@ -48,7 +48,7 @@ SUSPECTS = [
         STRETCH,
         "1",
         1,
-        0.1,
+        0.3,
         "measure the capacitance of the film at rest and stretched",
         with_stretch,
         key="eps-stretch",

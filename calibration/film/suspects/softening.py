@@ -36,4 +36,4 @@ def _softening(context: Context) -> Sequence[Shape]:
     return shapes
 
 
-SUSPECTS = [Kind(NAME, "1", 1, 0.01, REMEDY, _softening, key="softening")]
+SUSPECTS = [Kind(NAME, "1", 1, 0.03, REMEDY, _softening, key="softening")]

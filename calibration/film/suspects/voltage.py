@@ -43,5 +43,5 @@ def _growing(context: Context) -> Sequence[Shape]:
 
 SUSPECTS = [
     Kind(CONSTANT, "1", 1, 0.02, REMEDY, _constant, part="voltage at the film"),
-    Kind(GROWING, "1", 1, 0.02, REMEDY, _growing, key="voltage-loss"),
+    Kind(GROWING, "1", 1, 0.1, REMEDY, _growing, key="voltage-loss"),
 ]
