@@ -16,6 +16,24 @@ EPSILON_0 = 8.8541878188e-12
 
 
 @dataclass(frozen=True)
+class Branch:
+    """One Maxwell branch of a film that takes time (`model.membrane.history`).
+
+    ratio : its stiffness over that of the relaxed film; 0 is no branch
+    time : relaxation time (s)
+    """
+
+    ratio: float
+    time: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.ratio < math.inf:
+            raise ValueError(f"branch: ratio = {self.ratio!r}; it must not be negative, and finite")
+        if not 0.0 < self.time < math.inf:
+            raise ValueError(f"branch: time = {self.time!r} s; it must be positive and finite")
+
+
+@dataclass(frozen=True)
 class Material:
     r"""An incompressible dielectric elastomer.
 
@@ -32,6 +50,7 @@ class Material:
     max_stretch : largest stretch the film stands, or None when unknown
     source : where the numbers come from
     law : what ``mu`` and ``alpha`` are parameters of
+    branches : Maxwell branches beside the relaxed film; only `model.membrane.history` knows them
 
     See `with_law` for the law's own names, and ``values`` for the way back.
     """
@@ -44,6 +63,7 @@ class Material:
     max_stretch: float | None = None
     source: str = field(default="", compare=False)
     law: type[Law] = Ogden
+    branches: tuple[Branch, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mu", tuple(float(m) for m in self.mu))

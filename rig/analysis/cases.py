@@ -3,25 +3,39 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 
 from model.material.laws import find_law
-from model.material.materials import Material
+from model.material.materials import Branch, Material
 from model.material.ogden import Ogden
+from model.membrane.history import solve_history
 from model.membrane.solve import Solutions, Status, Wrinkling, solve_many
 from model.specimen import Specimen
 
 NUMBERS = ("a", "b", "thickness", "prestretch", "h")
 OPTIONAL = {"voltage": 0.0, "tolerance": 1e-8}
 KEYS = ("id", *NUMBERS, *OPTIONAL, "wrinkling", "material")
+ALONG = ("id", "a", "b", "thickness", "prestretch", "material", "history", "times")  # of a case along a history
 WRINKLING = ("plain", "tension_field")
 
 
 class CaseError(ValueError):
     """A case that does not describe a film; its text says which key, which value and what is allowed."""
+
+
+@dataclass(frozen=True)
+class HistoryCase:
+    """A case along a history that can be solved."""
+
+    specimen: Specimen
+    t: list[float]
+    h: list[float]
+    voltage: list[float]
+    times: list[float]
+    tolerance: float
 
 
 @dataclass(frozen=True)
@@ -45,6 +59,12 @@ def solve_cases(cases: Any) -> list[dict[str, Any]]:
     peak_field, min_hoop_stress, max_stretch, iterations``, the numbers None when there is no answer, and then a
     ``message``. A bad case gets the status "invalid" and does not touch its neighbours.
 
+    A film that takes time has ``material {..., branches: [{ratio, time_s}, ...]}``, and in place of ``h`` and
+    ``voltage`` the case has ``history {t: [...], h: [...], voltage: [...]}``, linear in between, and the ``times`` (s)
+    at which answers are wanted. Then ``status, F, error_estimate, peak_field, min_hoop_stress`` are lists over
+    ``times``; the error is over the largest force of the history, and ``tolerance`` is 1e-6 when left out. Without a
+    history the film is the relaxed one.
+
     Raises
     ------
     CaseError : ``cases`` is not a list
@@ -57,6 +77,9 @@ def solve_cases(cases: Any) -> list[dict[str, Any]]:
         name = raw.get("id") if isinstance(raw, dict) else None
         answers.append({"id": name})
         try:
+            if isinstance(raw, dict) and "history" in raw:
+                answers[number] |= _along(read_history_case(raw))
+                continue
             case = read_case(raw)
         except (CaseError, ValueError) as error:
             answers[number] |= _numbers(None, 0) | {"status": "invalid", "message": str(error)}
@@ -93,6 +116,36 @@ def _numbers(found: Solutions | None, at: int) -> dict[str, Any]:
     }
 
 
+def _along(case: HistoryCase) -> dict[str, Any]:
+    """Answers of a case along a history."""
+    found = solve_history(case.specimen, case.t, case.h, case.voltage, case.times, tolerance=case.tolerance)
+    status = [Status(int(one)) for one in found.status]
+    answer: dict[str, Any] = {"status": [one.name.lower() for one in status]}
+    for key, name in _FIELDS.items():
+        if hasattr(found, name):
+            values = getattr(found, name).tolist()
+            answer[key] = [value if math.isfinite(value) else None for value in values]
+    lost = [one.message for one in status if one > Status.WRINKLED]
+    return answer | {"iterations": found.steps} | ({"message": lost[0]} if lost else {})
+
+
+def read_history_case(raw: Any) -> HistoryCase:
+    """One case along a history, checked.
+
+    Raises
+    ------
+    CaseError, ValueError : the case does not describe a film or a history
+    """
+    table = _table(raw, "the case", (*ALONG, "tolerance"), ALONG)
+    history = _table(table["history"], "history", ("t", "h", "voltage"), ("t", "h"))
+    t, h, times = _list(history["t"], "history.t"), _list(history["h"], "history.h"), _list(table["times"], "times")
+    voltage = _list(history.get("voltage", [0.0] * len(t)), "history.voltage")
+    a, b, thickness, prestretch = (_number(table[key], key) for key in ("a", "b", "thickness", "prestretch"))
+    film = Specimen(a, b, thickness, prestretch, _material(table["material"]))
+    tolerance = _number(table.get("tolerance", 1e-6), "tolerance")
+    return HistoryCase(film, list(t), list(h), list(voltage), list(times), tolerance)
+
+
 def read_case(raw: Any) -> Case:
     """One case, checked.
 
@@ -126,12 +179,22 @@ def _material(raw: Any) -> Material:
         raise CaseError(f"material.law must be the name of a law, not {_kind(name)}")
     law = find_law(name)
     names = tuple(p.name for p in law.parameters(*law.counts(1)))
-    table = _table(raw, "material", ("law", *names, "eps_r"), (*names, "eps_r"))
+    table = _table(raw, "material", ("law", *names, "eps_r", "branches"), (*names, "eps_r"))
     values = {
         key: _list(table[key], f"material.{key}") if law.series else _number(table[key], f"material.{key}")
         for key in names
     }
-    return Material.with_law("case", law, values, _number(table["eps_r"], "material.eps_r"))
+    material = Material.with_law("case", law, values, _number(table["eps_r"], "material.eps_r"))
+    branches = table.get("branches", [])
+    if not isinstance(branches, list):
+        raise CaseError(f"material.branches must be a list of objects, not {_kind(branches)}")
+    return replace(material, branches=tuple(_branch(one, number) for number, one in enumerate(branches, start=1)))
+
+
+def _branch(raw: Any, number: int) -> Branch:
+    where = f"material.branches {number}"
+    table = _table(raw, where, ("ratio", "time_s"), ("ratio", "time_s"))
+    return Branch(*(_number(table[key], f"{where}.{key}") for key in ("ratio", "time_s")))
 
 
 def _kind(value: Any) -> str:

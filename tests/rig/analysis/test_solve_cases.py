@@ -112,3 +112,38 @@ def test_cases_must_be_a_list() -> None:
 
 def test_no_cases_no_answers() -> None:
     assert solve_cases([]) == []
+
+
+def test_a_case_along_a_history() -> None:
+    """A value of an independent code; beside it a case that is none, and one without history: the relaxed film."""
+    branches = [{"ratio": 0.1, "time_s": 1.0}, {"ratio": 0.1, "time_s": 30.0}]
+    material = {"mu": [5e3, 3.5e4], "alpha": [2.5, 5.6], "eps_r": 1.7, "branches": branches}
+    geometry = {"a": 4e-3, "b": 20e-3, "thickness": 40e-6, "prestretch": 1.2, "material": material}
+    history = {"t": [0, 10, 100], "h": [0, 10e-3, 10e-3], "voltage": [0, 0, 0]}
+    along = geometry | {"id": "along", "history": history, "times": [17.647059, 100.0]}
+    cases = [
+        along,
+        along | {"h": 1e-3},
+        along | {"history": {"t": [0, 10]}},
+        along | {"times": [101.0]},
+        along | {"material": material | {"branches": [{"ratio": -0.1, "time_s": 1.0}]}},
+        along | {"material": material | {"branches": {"ratio": 0.1}}},
+        along | {"material": material | {"branches": [{"ratio": 0.1}]}},
+        geometry | {"id": "relaxed", "h": 10e-3},
+        {key: value for key, value in along.items() if key != "times"},
+        along | {"history": {"t": [0, 10, 100], "h": [0, 10e-3, 10e-3]}, "tolerance": 1e-4},
+    ]
+    found = solve_cases(cases)
+    assert found[0]["status"] == ["taut", "taut"]
+    assert found[0]["F"] == pytest.approx([0.21955249, 0.215938708], abs=2.2e-7)
+    assert len(found[0]["error_estimate"]) == 2 and max(found[0]["error_estimate"]) < 1e-5
+    assert len(found[0]["peak_field"]) == len(found[0]["min_hoop_stress"]) == 2
+    for answer, words in zip(
+        found[1:7],
+        ("unknown key 'h'", "lacks the key 'h'", "within the history", "ratio", "list of objects", "time_s"),
+        strict=True,
+    ):
+        assert answer["status"] == "invalid" and words in answer["message"], answer
+    assert found[7]["F"] == pytest.approx(0.2156961965381, rel=1e-7)
+    assert found[8]["status"] == "invalid" and "times" in found[8]["message"]
+    assert found[9]["F"] == pytest.approx(found[0]["F"], rel=1e-4)
