@@ -20,12 +20,14 @@ from drivers.roles import HVSample, Sample
 from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.base.host import HostTime
 from rig.bench.bench import Bench
+from rig.engine.look import Outlook
 from rig.engine.outcome import NOT_SAFE_STATUS, Outcome
 from rig.engine.pause import pause
 from rig.engine.teardown import Rest, Teardown
 from rig.engine.watch import Watch, allowed_silence
 from rig.log.recorder import Gains, Recorder, Severity
 from rig.operator.control import Control
+from rig.operator.status import Status
 from rig.safety import heartbeat
 from rig.safety.arming import Arming
 from rig.safety.guard import AnyGuard, Guard
@@ -79,6 +81,8 @@ class Engine:
         How he chose, when he started the run, to have an output taken down that is found live; empty: he did not.
     guard_process : RemoteGuard, optional
         The guard, when it is a process of its own; without it the engine makes one for a supply in memory.
+    show : callable, optional
+        ``show(status)`` about five times a second, before ``progress``; as that, it must return at once.
     """
 
     def __init__(
@@ -93,6 +97,7 @@ class Engine:
         requested: str = "",
         take_down: str = "",
         guard_process: RemoteGuard | None = None,
+        show: Callable[[Status], None] | None = None,
     ) -> None:
         self.bench = bench
         self.clock = bench.clock
@@ -107,12 +112,17 @@ class Engine:
         self._progress = progress
         self._certificates = certificates or {}
         self._guard_process = guard_process
+        self._show_status = show
+        self._outlook = Outlook(self.rig, actions, max((action.step for action in actions), default=0))
         self._host = HostTime(self.clock)
         self._beats = 0
         self._next_beat = -math.inf
         self._watch: Watch | None = None
         self._started = self.clock.now()
         self._next_progress = 0.0
+        self._number = 0  # of the action that is being carried out
+        self._began = 0.0
+        self._doing_now: Action | None = None
         self._doing = ""
 
     @property
@@ -266,7 +276,8 @@ class Engine:
     def _carry_out_all(self) -> None:
         total = sum(action.duration for action in self._actions)
         done = 0.0
-        for action in self._actions:
+        for number, action in enumerate(self._actions):
+            self._number = number
             while not self._carry_out(action, done, total):
                 self._pause(action, done, total)
             done += action.duration
@@ -274,7 +285,8 @@ class Engine:
 
     def _carry_out(self, action: Action, done: float, total: float) -> bool:
         """Whether the action came to its end; False when the operator wants a pause."""
-        began = self.clock.now()
+        began = self._began = self.clock.now()
+        self._doing_now = action
         write_phase(
             self.rig,
             action,
@@ -313,7 +325,21 @@ class Engine:
         if self.clock.now() >= self._next_progress:
             self._next_progress = self.clock.now() + 0.2
             question = self.control.question
-            self._show(done, total, f"waiting for you: {question.text}" if question is not None else label)
+            label = f"waiting for you: {question.text}" if question is not None else label
+            self._show_numbers(label)
+            self._show(done, total, label)
+
+    def _show_numbers(self, label: str) -> None:
+        """Show the status. As with progress, a display that fails must not end an experiment."""
+        action = self._doing_now
+        if self._show_status is None or action is None:
+            return
+        elapsed = 0.0 if self.control.pausing else self.clock.now() - self._began
+        try:
+            self._show_status(self._outlook.look(self._number, action, elapsed, label))
+        except Exception as error:
+            self._show_status = None
+            self.recorder.event("warning", "engine", f"the status line failed: {error!r}")
 
     def _show(self, done: float, total: float, label: str) -> None:
         """Show progress. A terminal that is gone must not end an experiment."""

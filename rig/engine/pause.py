@@ -10,6 +10,8 @@ from rig.steps.regain import regain
 from rig.steps.rig import Rig
 from rig.steps.turns import halt
 
+HOW_TO_GO_ON = "To go on: c and Enter here, or `dea-rig continue` elsewhere. To end: s and Enter, or Ctrl-C."
+
 
 def pause(rig: Rig, action: Action) -> Turns:
     """Stage standing, voltage measured off, until the operator continues; then back to where ``action`` begins.
@@ -19,7 +21,8 @@ def pause(rig: Rig, action: Action) -> Turns:
     while True:
         yield from halt(rig)
         yield from take_down(rig, "the operator's pause")
-        rig.control.say("Paused: the stage stands" + (", the voltage is off." if rig.guard is not None else "."))
+        state = "the stage stands" + (", the voltage is off" if rig.guard is not None else "")
+        rig.control.say(f"Paused: {state}. {HOW_TO_GO_ON}")
         while rig.control.pausing:
             yield
         rig.recorder.operator("continues", "", "")

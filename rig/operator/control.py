@@ -153,7 +153,7 @@ class Control(StopRequest):
             self.ask_pause(source)
             return "Pausing: the stage stops, the voltage ramps to zero."
         if self.question is not None and self.answer is None:  # the loop takes the answer at its next turn
-            if self.question.expected and text != self.question.expected:
+            if self.question.expected and not _is_expected(text, self.question.expected):
                 return f"That is not what is asked for: type {self.question.expected}, or s to stop."
             self.answer = Answer(text, source)
             return "Answered."
@@ -209,6 +209,14 @@ class Voice:
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(None)
         self._thread.join(PATIENCE_S)
+
+
+def _is_expected(text: str, expected: str) -> bool:
+    """Whether that was typed, letter by letter; a voltage may have its unit behind it ("800 V" for "800")."""
+    if text == expected:
+        return True
+    number = text.removesuffix("V").removesuffix("v").rstrip()
+    return expected.replace(".", "", 1).isdigit() and number == expected
 
 
 class Keyboard:

@@ -22,6 +22,7 @@ from rig.steps.base import Action, OnResume, Positive, State, Step, Turns, allow
 from rig.steps.rig import Rig
 from rig.steps.turns import Readings, arrive, go, listening, mean_of, pause, wait
 
+FOUND_AFTER = 0.25  # of max_travel, for the estimate of the time left: scenes begin the approach near the film
 CONTACT_WINDOW_S = 0.25  # force is averaged over this long before it is held against the contact threshold
 CONTACT_SIGMAS = 4.0  # the threshold must exceed the noise of that average this many times
 # Towards contact the stage is sent in legs, so that it stops by itself when nobody renews them: never further ahead of
@@ -106,6 +107,12 @@ class Approaching(Action):
     fast: float
     max_travel: float
     force_rate: float
+
+    @property
+    def likely(self) -> float:
+        """The film is usually met in the first part of the way that is searched for it."""
+        slow = self.max_travel / self.speed
+        return self.duration - (1.0 - FOUND_AFTER) * slow
 
     def check(self, specimen: Specimen, limits: Limits, force_noise: float) -> None:
         """The threshold lies above the noise, and below what the film gives within the limits."""

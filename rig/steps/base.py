@@ -171,6 +171,11 @@ class Action(ABC):
         """How long its way may take before that is a fault."""
         return allowed(self.duration)
 
+    @property
+    def likely(self) -> float:
+        """Seconds that it will probably take, where that is less than what is planned for."""
+        return self.duration
+
     def check(self, specimen: Specimen, limits: Limits, force_noise: float) -> None:  # noqa: B027 # most have nothing
         """Refuse before anything moves what only this kind of action knows; nothing by default.
 

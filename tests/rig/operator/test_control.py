@@ -174,3 +174,33 @@ def test_of_several_runs_one_has_to_be_named(folder: Path) -> None:
                 live_run()
             with pytest.raises(ConfigError, match="Use the emergency stop"):
                 live_run(Path("/2.mcap")).send("stop")
+
+
+@pytest.mark.parametrize(
+    ("typed", "taken"),
+    [
+        ("800", True),
+        ("800 V", True),
+        ("800V", True),
+        (" 800  v ", True),
+        ("800 kV", False),
+        ("8000", False),
+        ("80 0", False),
+        ("V", False),
+        ("", False),
+        ("+800", False),
+        ("800 V V", False),
+    ],
+)
+def test_a_voltage_may_be_typed_with_its_unit(typed: str, taken: bool) -> None:
+    control = Control()
+    control.put(Question("High voltage up to 800 V?", expected="800"))
+    said = control.take(typed, "the keyboard")
+    assert (control.answer is not None) is taken, said
+
+
+def test_a_word_that_is_asked_for_has_no_unit() -> None:
+    control = Control()
+    control.put(Question("Take it down?", expected="take down"))
+    control.take("take down V", "the keyboard")
+    assert control.answer is None
