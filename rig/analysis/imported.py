@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from calibration.film.curve import CurveError
-from calibration.sheet.sheet_tests import HomogeneousTest, TestsError, TestsFit, fit_tests
+from calibration.sheet.fit import Compared, TestsFit, compare_laws, fit_tests
+from calibration.sheet.problem import Weighting
+from calibration.sheet.sheet_tests import HomogeneousTest, TestsError
+from model.material.laws import known_laws
 from rig.analysis.film import UNKNOWN_LAG, Found, dimension_errors, identify_curves, law_called
 from rig.base.errors import ConfigError, DataError
 from rig.base.table import Table
@@ -115,14 +118,19 @@ def read_sheets(paths: Sequence[Path], predict: Sequence[Path], options: ImportO
 
 
 def identify_sheets(read: SheetsRead, *, law: str = "ogden", **options: Any) -> TestsFit:
-    """`fit_tests` on tests that were read; ``options`` as there, the law by its name.
+    """`fit_tests` on tests that were read; ``options`` as there.
 
     Raises
     ------
     DataError
-        When the tests cannot be fitted.
+        When there is no such law, or the tests cannot be fitted.
     """
     try:
-        return fit_tests(read.tests, law=law_called(law), predict=read.predict, **options)
+        return fit_tests(read.tests, predict=read.predict, law=law_called(law), **options)
     except TestsError as error:
         raise DataError(f"{error}.") from None
+
+
+def compare_sheets(read: SheetsRead, weighting: Weighting) -> list[Compared]:
+    """Every known law on the tests that were read."""
+    return compare_laws(read.tests, list(known_laws().values()), weighting=weighting)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,62 +14,109 @@ from rig.cli.import_options import import_options, taken, understood_or_refused,
 
 if TYPE_CHECKING:
     from rich.console import Group
+    from rich.table import Table
 
-    from calibration.sheet.sheet_tests import TestsFit
+    from calibration.sheet.fit import Compared, TestsFit
 
 
 @click.command("fit-tests")
 @click.argument("tests", nargs=-1, required=True, type=FILE)
 @click.option("-o", "--out", type=FILE, help="Result as JSON.")
-@click.option("--law", default="ogden", show_default=True, help="Law of the sheet, e.g. yeoh.")
-@click.option("--terms", type=click.IntRange(1, 4), default=3, show_default=True, help="Ogden terms.")
+@click.option("--report", type=FILE, help="Result as one self-contained HTML page.")
+@click.option("--law", default="ogden", show_default=True, metavar="NAME", help="ogden, neo-hooke, yeoh, gent, ...")
+@click.option(
+    "--terms", type=click.IntRange(1, 4), default=3, show_default=True, help="Terms of a law that is a series."
+)
+@click.option(
+    "--weighting",
+    type=click.Choice(["balanced", "absolute", "relative", "noise"]),
+    default="balanced",
+    show_default=True,
+    help="What counts: each test alike, errors in Pa, relative errors, or errors in units of each test's noise.",
+)
+@click.option("--compare", "comparing", is_flag=True, help="Judge all laws: AICc, prediction of the other modes.")
 @click.option("--predict", multiple=True, type=FILE, help="A test that takes no part and is predicted.")
 @import_options(sheet=True)
 def command(
     tests: tuple[Path, ...],
     out: Path | None,
+    report: Path | None,
     law: str,
     terms: int,
+    weighting: Any,
+    comparing: bool,
     predict: tuple[Path, ...],
     dry_run: bool,
     tidy: Path | None,
     **words: Any,
 ) -> None:
-    """Identify a law from homogeneous TESTS of a sheet, all at once.
+    """Identify the parameters of a law from homogeneous TESTS of a sheet, all at once.
 
     TESTS are tables as testing machines and spreadsheets write them: text in any encoding, separator and decimal sign,
     with columns of stretch, strain or extension, and of nominal stress or force. What is understood of each is printed
     first; what cannot be understood is asked for, with the option that tells it. A shared set of options can stand in
     DATA.import.toml beside DATA.csv. The kind of test is in the file, in its name, or in --kind.
     """
-    from rig.analysis.imported import identify_sheets, read_sheets
+    from rig.analysis.imported import compare_sheets, identify_sheets, read_sheets
     from rig.base.outputs import check_new, write_text
     from rig.cli.show import show
 
-    check_new(out, tidy)
+    check_new(out, report, tidy)
     read = understood_or_refused(lambda: read_sheets(tests, predict, taken(words)))
     if tidy is not None:
         from rig.importing.tidy import write_sheet_tests
 
         write_sheet_tests(tidy, read.tests)
-    if not dry_run:
-        found = identify_sheets(read, terms=terms, law=law)
-        if out is not None:
-            write_text(out, with_import(found.to_json(), read.understood))
-        show(tests_table(found))
-    tell_written(None if dry_run else out, tidy)
+    if dry_run:
+        tell_written(tidy)
+        return
+    found = identify_sheets(read, law=law, terms=terms, weighting=weighting)
+    compared = compare_sheets(read, weighting) if comparing else []
+    if out is not None:
+        result = found.to_dict() | ({"compared": [one.to_dict() for one in compared]} if compared else {})
+        write_text(out, with_import(result, read.understood))
+    if report is not None:
+        from calibration.sheet.report import write_report
+
+        told = [line for one in read.understood for line in one.lines()]
+        write_report(report, found, [*read.tests, *read.predict], compared, told)
+    show(tests_table(found), *([compared_table(compared)] if compared else []))
+    tell_written(out, report, tidy)
+
+
+def compared_table(compared: Sequence[Compared]) -> Table:
+    """Laws beside each other."""
+    from rich.table import Table
+
+    kinds = sorted({kind for one in compared for kind in one.predicted})
+    table = Table(
+        title="Laws: smaller AICc is better, differences below 2 mean nothing",
+        caption="R^2 of a kind of test as predicted by a fit to the other kinds"
+        if kinds
+        else "only one kind of test: what the laws predict of other modes cannot be judged",
+    )
+    table.add_column("law", overflow="fold")
+    table.add_column("AICc", justify="right")
+    for kind in kinds:
+        table.add_column(kind, justify="right", overflow="fold")
+    known = [one.fit.aicc for one in compared if math.isfinite(one.fit.aicc)]
+    for one in sorted(compared, key=lambda each: each.fit.aicc if math.isfinite(each.fit.aicc) else math.inf):
+        aicc = f"{one.fit.aicc - min(known):+.1f}" if math.isfinite(one.fit.aicc) else "too few data"
+        table.add_row(one.title, aicc, *(_share(one.predicted.get(kind, math.nan)) for kind in kinds))
+    return table
 
 
 def tests_table(found: TestsFit) -> Group:
-    """The law from homogeneous tests, and how much of each test they explain."""
+    """Ogden terms from homogeneous tests, and how much of each test they explain."""
     from rich.console import Group
     from rich.table import Table
 
     from rig.cli.show import quantities_table
 
-    terms = f" with {len(found.mu)} terms" if found.law.series else ""
-    title = f"Identified from homogeneous tests: {found.law.title} law{terms}"
-    table = quantities_table(title, found.quantities)
+    terms = f" with {len(found.mu)} term{'s' if len(found.mu) > 1 else ''}" if found.law.series else ""
+    table = quantities_table(
+        f"Identified from homogeneous tests: {found.law.title}{terms}, {found.weighting} weighting", found.quantities
+    )
     explained = Table(title="Share of variance explained, R^2")
     explained.add_column("test")
     explained.add_column("fitted", justify="right")
@@ -76,9 +125,16 @@ def tests_table(found: TestsFit) -> Group:
         explained.add_row(name, _share(share), "")
     for name, share in found.prediction.items():
         explained.add_row(name, "", _share(share))
-    return Group(table, explained, *(f"note: {warning}" for warning in found.warnings))
+    return Group(
+        table,
+        explained,
+        f"convention: {found.law.description}",
+        *(f"note: {warning}" for warning in found.warnings),
+    )
 
 
 def _share(share: float) -> str:
     """R^2 as text; far below zero, where any constant does better, its digits mean nothing."""
+    if math.isnan(share):
+        return "-"
     return f"{share:.5f}" if share >= -10.0 else "< -10"

@@ -107,7 +107,7 @@ def understood_or_refused(read: Callable[[], R]) -> R:
     return found
 
 
-def with_import(text: str, understood: Sequence[Understood]) -> str:
-    """The JSON text of a result with what was understood of its tables."""
-    result = json.loads(text) | {"import": [one.to_dict() for one in understood]}
+def with_import(result: dict[str, Any], understood: Sequence[Understood]) -> str:
+    """A result, with what was understood of its tables, as JSON text."""
+    result = result | {"import": [one.to_dict() for one in understood]}
     return json.dumps(result, indent=2, allow_nan=False) + "\n"

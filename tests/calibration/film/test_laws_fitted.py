@@ -12,7 +12,9 @@ from calibration.film.curve import Curve
 from calibration.film.identifiability import expected_uncertainties
 from calibration.film.identify import IdentificationError, identify
 from calibration.film.propagation import secant_modulus, shear_slopes
-from calibration.sheet.sheet_tests import HomogeneousTest, fit_tests, nominal_stress
+from calibration.sheet.fit import fit_tests
+from calibration.sheet.problem import nominal_stress
+from calibration.sheet.sheet_tests import HomogeneousTest
 from model.material.gent import Gent
 from model.material.laws import find_law
 from model.material.materials import Material

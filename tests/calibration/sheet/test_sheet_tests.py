@@ -6,16 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.sheet.sheet_tests import (
-    HomogeneousTest,
-    TestsError,
-    _TestsProblem,
-    cross_prediction,
-    fit_tests,
-    nominal_stress,
-    r_squared,
-)
-from model.material.ogden import Ogden
+from calibration.sheet.fit import cross_prediction, fit_tests
+from calibration.sheet.problem import SheetProblem, nominal_stress, r_squared
+from calibration.sheet.sheet_tests import HomogeneousTest, TestsError
 from rig.importing.sheet_table import read_sheet_tests
 
 # Published test data, kept beside the project; without it the tests on it are skipped.
@@ -73,7 +66,7 @@ def test_joint_fit_of_treloars_data(treloar: list[HomogeneousTest], kawabata: Ho
     assert fit.r_squared["treloar1944_pure_shear"] >= 0.998
     assert fit.prediction["kawabata1981_biaxial"] > 0.95  # another rubber, another laboratory, two directions
     assert fit.others == []
-    assert fit.quantities["G"].verdict == "identified"
+    assert fit.quantities["G"].relative < 0.15  # relative weights see another stiffness at small strains
 
 
 def test_joint_fit_with_relative_weights_lands_near_the_published_set(treloar: list[HomogeneousTest]) -> None:
@@ -112,11 +105,11 @@ def test_known_terms_are_recovered_within_their_stated_uncertainty() -> None:
     for name, truth in (("mu1", 5e3), ("mu2", 3.5e4), ("alpha1", 2.5), ("alpha2", 5.6), ("G", 104_250.0)):
         quantity = fit.quantities[name]
         assert abs(quantity.value - truth) < 3.5 * quantity.uncertainty, name
-    assert fit.quantities["alpha2"].relative < 0.05
+    assert fit.quantities["alpha2"].budget["scatter"] < 0.05 * fit.alpha[1]
 
 
 def test_analytic_jacobian_against_finite_differences(treloar: list[HomogeneousTest]) -> None:
-    problem = _TestsProblem(treloar, Ogden, 3, "balanced")
+    problem = SheetProblem(treloar, 3, "balanced")
     x = np.array([0.02, 0.9, 0.1, -1.7, 1.4, 4.6])
     jacobian = problem.jacobian(x)
     for k in range(6):
@@ -160,3 +153,83 @@ def test_stresses_that_nothing_can_be_fitted_to_are_named() -> None:
         test = HomogeneousTest("flat", "uniaxial", stretch, stretch**-0.5, stress, np.full(5, np.nan))
         with pytest.raises(TestsError, match=f"flat: .*{words}"):
             fit_tests([test], terms=1)
+
+
+def test_a_test_given_twice_and_rows_repeated_shrink_nothing(treloar: list[HomogeneousTest]) -> None:
+    uniaxial = treloar[0]
+    repeated = HomogeneousTest(
+        "repeated", "uniaxial", *(np.repeat(column, 5) for column in (uniaxial.stretch1, uniaxial.stretch2)),
+        *(np.repeat(column, 5) for column in (uniaxial.stress1, uniaxial.stress2)),
+    )  # fmt: skip
+    once = fit_tests([uniaxial], terms=2).quantities
+    for tests in ([uniaxial, uniaxial], [repeated]):
+        again = fit_tests(tests, terms=2)
+        for name, quantity in once.items():
+            assert again.quantities[name].value == pytest.approx(quantity.value, rel=1e-4)
+            assert again.quantities[name].uncertainty >= 0.99 * quantity.uncertainty
+        assert any("given before" in warning for warning in again.warnings)
+
+
+def test_correlated_residuals_widen_what_is_stated() -> None:
+    """A law that cannot bend as the sheet does leaves a wave; counted as noise it would promise ten times too much."""
+    stretch = np.linspace(1.0, 3.0, 400)
+    exact = HomogeneousTest("x", "uniaxial", stretch, stretch**-0.5, np.zeros(400), np.full(400, np.nan))
+    stress = nominal_stress((4e4, 3e3), (1.5, 5.0), exact)
+    test = HomogeneousTest("wave", "uniaxial", stretch, stretch**-0.5, stress, np.full(400, np.nan))
+    fit = fit_tests([test], terms=1)
+    judged = fit.tests["wave"]
+    assert judged.correlation > 20.0
+    off = abs(fit.quantities["G"].value - 0.5 * (4e4 * 1.5 + 3e3 * 5.0))
+    assert off < 3.0 * fit.quantities["G"].uncertainty
+    assert fit.quantities["G"].verdict != "identified"
+    assert any("lack of fit" in warning for warning in fit.warnings)
+    assert any("small strains" in warning for warning in fit.warnings)
+
+
+def test_a_term_of_the_other_sign_is_told_with_the_reason() -> None:
+    stretch = np.linspace(1.0, 2.5, 60)
+    exact = HomogeneousTest("x", "uniaxial", stretch, stretch**-0.5, np.zeros(60), np.full(60, np.nan))
+    stress = nominal_stress((9e4, -9e3), (2.0, 3.2), exact)
+    stress += np.random.default_rng(3).normal(0.0, 20.0, 60)
+    fit = fit_tests([HomogeneousTest("odd", "uniaxial", stretch, stretch**-0.5, stress, np.full(60, np.nan))], terms=2)
+    assert any("other sign" in warning and "excluded" in warning for warning in fit.warnings)
+
+
+def independent_best(tests: list[HomogeneousTest], terms: int, relative: bool) -> float:
+    """The least sum of squares by differential evolution over exponents and SciPy's own non-negative least squares."""
+    from scipy.optimize import differential_evolution, nnls
+
+    measured = np.concatenate([test.stress1[np.isfinite(test.stress1)] for test in tests])
+    if relative:
+        weight = 1.0 / np.maximum(np.abs(measured), 0.01 * np.abs(measured).max())
+    else:
+        weight = np.concatenate(
+            [np.full(t.stress1.size, 1.0 / np.linalg.norm(t.stress1 - t.stress1.mean())) for t in tests]
+        )
+    l1 = np.concatenate([test.stretch1 for test in tests])
+    l3 = 1.0 / (l1 * np.concatenate([test.stretch2 for test in tests]))
+
+    def cost(u: np.ndarray) -> float:
+        alpha = np.sign(u) * 0.05 * (30.0 / 0.05) ** np.abs(u)
+        columns = weight[:, None] * np.sign(alpha) * (l1[:, None] ** alpha - l3[:, None] ** alpha) / l1[:, None]
+        norms = np.linalg.norm(columns, axis=0)
+        return float(nnls(columns / norms, weight * measured)[1] ** 2)
+
+    bounds = [(-1.0, 1.0)] * terms
+    return min(
+        float(differential_evolution(cost, bounds, seed=k, popsize=16, maxiter=150, tol=1e-10, polish=True).fun)
+        for k in (1, 2)
+    )
+
+
+@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize(
+    "name", ["treloar1944_uniaxial", "vhb4910_uniaxial_equilibrium_hossain2012", "treloar1944_equibiaxial"]
+)
+def test_the_optimum_is_the_best_that_an_independent_search_finds(name: str, relative: bool) -> None:
+    if not DATA.is_dir():
+        pytest.skip("the published data are not there")
+    test = load_test(DATA / f"{name}.csv")
+    terms = 3 if test.stretch1.size > 10 else 2
+    fit = fit_tests([test], terms=terms, weighting="relative" if relative else "balanced")
+    assert fit.cost <= 1.001 * independent_best([test], terms, relative)
