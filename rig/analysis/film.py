@@ -23,7 +23,7 @@ from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
 from rig.base.outputs import write_text
 from rig.base.toml_file import parse_table
-from rig.log.contents import IN_MEMORY
+from rig.log.contents import IN_MEMORY, bench_of, bench_word
 from rig.log.dataset import CurveErrors, Run, SpecimenErrors, load_run
 from rig.scene.scene import Scene
 from rig.scene.specimen import SpecimenTable
@@ -83,9 +83,13 @@ def identify_logs(
     """
     runs = [load_run(path) for path in paths]
     scenes = [parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)") for run in runs]
+    benches = {str(path): bench_of(run.log) for path, run in zip(paths, runs, strict=True)}
+    _check_one_kind(benches)
     hashes = {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
     provenance: dict[str, object] = {
         "logs": hashes,
+        "bench": bench_word(next(iter(benches.values()))),
+        "benches": benches,
         "outcomes": {str(run.log.path): (run.log.outcome or {}).get("status", "cut off") for run in runs},
     }
     if len(set(hashes.values())) < len(paths):
@@ -184,6 +188,14 @@ def law_called(name: str) -> type[Law]:
         return find_law(name)
     except ValueError as error:
         raise DataError(f"{error}.") from None
+
+
+def _check_one_kind(benches: Mapping[str, str]) -> None:
+    """A film on hardware and a simulated one are two films; a log that does not say counts as hardware."""
+    kinds = {path: bench_word(bench) for path, bench in benches.items()}
+    if len(set(kinds.values())) > 1:
+        listed = ", ".join(f"{path}: {kind}" for path, kind in kinds.items())
+        raise DataError(f"These logs are of different benches and are not fitted together ({listed}).")
 
 
 def _without_compliance(curve: Curve, run: Run, certificates: Mapping[str, Certificate]) -> Curve:
@@ -373,7 +385,7 @@ def dimension_errors(dimensions: SpecimenTable) -> SpecimenErrors:
 
 
 def _truth(runs: Sequence[Run], scenes: Sequence[Scene]) -> Material | None:
-    if any(run.log.metadata.get("run", {}).get("bench") != IN_MEMORY for run in runs):
+    if any(bench_of(run.log) != IN_MEMORY for run in runs):
         return None
     truths = set()
     for scene in scenes:

@@ -77,7 +77,7 @@ def spawn(experiment: Experiment, wanted: dict[str, Any]) -> None:
             signal.signal(signal.SIGUSR1, _spin)
             try:
                 run(
-                    replace(experiment, scene=experiment.scene.with_ports(wanted["ports"])),
+                    replace(experiment, scene=experiment.scene.with_ports(wanted["ports"]), served=True),
                     log,
                     lambda *_: None,
                     CONSENT,

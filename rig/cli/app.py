@@ -61,9 +61,11 @@ class Commands(click.Group):
             code = _exit_code(error)
             if code is None:
                 raise
-            click.secho(_plain(error), err=True, fg="red")
+            from rig.base.terminal import tell
+
+            tell(_plain(error), colour="red")
             for note in getattr(error, "__notes__", []):
-                click.echo(_plain(note), err=True)
+                tell(_plain(note))
             ctx.exit(code)
 
 

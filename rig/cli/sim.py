@@ -18,6 +18,7 @@ def command(scene: Path) -> None:
     from rig.base.clock import RealClock
     from rig.base.errors import ConfigError
     from rig.operator.signals import stop_on_signals
+    from rig.protocol.experiment import SERVED_BY, SERVER
     from rig.run.backend import wired_bench
     from rig.scene.scene import load_scene
 
@@ -29,7 +30,7 @@ def command(scene: Path) -> None:
     server = Server(wired_bench(loaded, real_time=True), RealClock())
     with stop_on_signals() as stop:
         try:
-            click.echo(json.dumps(server.ports))
+            click.echo(json.dumps({**server.ports, SERVED_BY: SERVER}))
             server.run(lambda: stop.count > 0)
         finally:
             server.close()

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-NOT_SAFE_STATUS = "not safe"
+NOT_SAFE_STATUS = "NOT SAFE"
 
 
 @dataclass(frozen=True)
 class Outcome:
     """Why the run ended, and the measured state it ended in.
 
-    ``status`` is one of complete, stopped, limit, fault; or "not safe", which is worse than all of them, whenever
+    ``status`` is one of complete, stopped, limit, fault; or NOT SAFE, which is worse than all of them, whenever
     ``safe`` is False. ``reason`` says what ended the run in any case. ``safe`` is True only when the output was
     *measured* below 60 V twice, or when the scene has no HV; ``standing`` only when the stage said that it stands.
     """

@@ -16,10 +16,28 @@ if TYPE_CHECKING:
     from calibration.sensors.certificate import Certificate
 
 # In a log's metadata: on what bench it was. In memory its truth is that of its own scene.
-IN_MEMORY, ON_PORTS = "simulated in memory", "real ports"
+IN_MEMORY, ON_SERVED_PORTS, ON_PORTS = "simulated in memory", "simulated on pseudo-terminals", "real ports"
+REPLAY_OF = "replay of "
 
 # Older logs say it in one sentence. A model may hold commas; serial number and firmware do not.
 _SAID = re.compile(r"model (.*), serial ([^,;]*), firmware ([^,;]*)(?:;|$)")
+
+
+def bench_of(log: Log) -> str:
+    """On what bench a log was recorded, in the words above; empty where it does not say."""
+    return log.metadata.get("run", {}).get("bench", "")
+
+
+def is_real(bench: str) -> bool:
+    """Whether a bench in these words is hardware: whatever is not known to be simulated or replayed."""
+    return bench not in (IN_MEMORY, ON_SERVED_PORTS) and not bench.startswith(REPLAY_OF)
+
+
+def bench_word(bench: str) -> str:
+    """The word with which every run begins, and every report."""
+    if is_real(bench):
+        return "REAL PORTS"
+    return "REPLAY" if bench.startswith(REPLAY_OF) else "SIMULATED"
 
 
 def certificates_in(log: Log) -> dict[str, Certificate]:

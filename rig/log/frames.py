@@ -18,7 +18,8 @@ MESSAGE, ATTACHMENT, METADATA, FINISH = range(1, 5)
 READY, ALIVE, DONE, FAILED = range(5, 9)
 
 MESSAGE_HEAD = struct.Struct("<BQQ")  # index of the topic in rig.log.schema.CHANNELS, log time, publish time
-FREE = struct.Struct("<q")  # in ALIVE: bytes free on the disk; -1: not known
+# In ALIVE: bytes free on the disk (-1: not known), and for how long the writer has been busy with one turn (s).
+STATE = struct.Struct("<qd")
 
 
 def pack(kind: int, body: bytes) -> bytes:

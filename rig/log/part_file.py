@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -31,7 +32,7 @@ class PartFile:
                 raise UnusableFile(existing, "exists already", advice)
         try:
             self._fd: int | None = os.open(
-                self.part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644
+                self.part, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644
             )
             _sync_directory(self.part.parent)
         except OSError as error:
@@ -49,6 +50,45 @@ class PartFile:
             raise LogError(self._failure.path, self._failure.what, self._failure.advice)
         if self._fd is None:
             raise LogError(self.path, "is finished; nothing can be added")
+
+    def check_place(self) -> None:
+        """Raise when the file was deleted or replaced while it is written, which no write would notice.
+
+        What was written is then copied beside it, or to the temporary directory where that cannot be.
+        """
+        self.check()
+        assert self._fd is not None
+        here = os.fstat(self._fd)
+        try:
+            there = self.part.stat()
+        except OSError:
+            there = None
+        if there is not None and os.path.samestat(here, there):
+            return
+        what = "was deleted or moved" if there is None else "was replaced by another file"
+        saved = self._save_elsewhere()
+        advice = "It could not be saved." if saved is None else f"What was recorded is saved in {saved}."
+        raise self._fail(f"{self.part.name} {what} while it was written; nothing more is written", advice)
+
+    def _save_elsewhere(self) -> Path | None:
+        assert self._fd is not None
+        for folder in (self.part.parent, Path(tempfile.gettempdir())):
+            for number in range(100):
+                target = folder / f"{self.path.name}.saved-{number}"
+                try:
+                    copy = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644)
+                except FileExistsError:
+                    continue
+                except OSError:
+                    break
+                with os.fdopen(copy, "wb") as file, suppress(OSError):
+                    os.lseek(self._fd, 0, os.SEEK_SET)
+                    while data := os.read(self._fd, 1 << 20):
+                        file.write(data)
+                    self._close()
+                    return target
+        self._close()
+        return None
 
     def put(self, data: bytes) -> None:
         """Append all of ``data``."""
@@ -115,8 +155,8 @@ class PartFile:
             with suppress(OSError):
                 os.close(fd)
 
-    def _fail(self, what: str) -> LogError:
-        self._failure = LogError(self.path, what, "Free some space or use another disk, then repeat the run.")
+    def _fail(self, what: str, advice: str = "Free some space or use another disk, then repeat the run.") -> LogError:
+        self._failure = LogError(self.path, what, advice)
         return self._failure
 
 

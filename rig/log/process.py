@@ -25,7 +25,7 @@ from rig.log.remote import RemoteLog
 
 START_S = 20.0  # the new process must have made the file by then
 FINISH_S = 30.0  # syncing a long log and waiting for a second producer
-LEAVE_S = 5.0
+LEAVE_S = 2.0
 
 
 class LogProcess(RemoteLog):
@@ -120,9 +120,13 @@ class LogProcess(RemoteLog):
         self.close()
 
     def _leave(self) -> None:
-        """Wait for the writer to end; one that hangs is left to itself, it may still save what it holds."""
-        with suppress(subprocess.TimeoutExpired):
+        """Wait for the writer to end; one that hangs is ended; what it has written stays."""
+        try:
             self._process.wait(LEAVE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(LEAVE_S)
 
     def _wait_for(self, kind: int, seconds: float) -> None:
         clock = RealClock()

@@ -32,7 +32,9 @@ from rig.log.checks import Checks
 from rig.log.errors import LogError
 
 MOST_WAITING = 8 * 1024 * 1024  # bytes not yet taken by the writer: half a minute of a run with all sensors at 1 kHz
-SILENCE_S = 5.0  # the writer says ten times a second that it lives; a disk may keep it that long
+SILENCE_S = 0.8  # the writer says ten times a second that it lives, by a thread of its own ...
+LATE_S = 0.05  # a turn of ours that took longer is not the writer's silence
+BUSY_S = 5.0  # ... and for how long it has waited for its disk, which may keep it that long
 PATIENCE_S = 10.0  # for what may block: an attachment before the run, closing
 
 _TOPICS = {topic: number for number, topic in enumerate(schema.CHANNELS)}
@@ -68,6 +70,8 @@ class RemoteLog:
         self._unpack = frames.Unpacker()
         self._failure: LogError | None = None
         self._last_heard: float | None = None
+        self._last_tick: float | None = None
+        self._busy = 0.0  # for how long the writer has waited for its disk (s)
         self._heard: set[int] = set()  # kinds of frames since last looked
 
     def write(self, topic: str, fields: Mapping[str, Any], log_ns: int, publish_ns: int) -> None:
@@ -93,13 +97,19 @@ class RemoteLog:
         self._check()
         self._send()
         self._listen()
+        late = now - self._last_tick - LATE_S if self._last_tick is not None else 0.0
+        self._last_tick = now
         if self._heard or self._last_heard is None:
             self._last_heard = now
             self._heard.clear()
-        elif not now - self._last_heard < SILENCE_S:
+        elif late > 0:  # nobody has listened meanwhile
+            self._last_heard = min(self._last_heard + late, now)
+        if not now - self._last_heard < SILENCE_S:
+            raise self._fail(f"the process that writes the log has not answered for {SILENCE_S:g} s", "It hangs.")
+        if not self._busy < BUSY_S:
             raise self._fail(
-                f"the process that writes the log has not answered for {SILENCE_S:.0f} s",
-                "Its disk may hang or be very slow.",
+                f"the process that writes the log has waited for its disk for {self._busy:.0f} s",
+                "The disk hangs or is very slow.",
             )
         return self._free
 
@@ -146,7 +156,7 @@ class RemoteLog:
                 for kind, body in found:
                     self._heard.add(kind)
                     if kind == frames.ALIVE:
-                        (free,) = frames.FREE.unpack(body)
+                        free, self._busy = frames.STATE.unpack(body)
                         self._free = free if free >= 0 else None
                     elif kind == frames.FAILED:
                         path, what, advice = json.loads(body)

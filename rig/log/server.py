@@ -13,8 +13,9 @@ import select
 import signal
 import socket
 import sys
+import threading
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 from rig.base.clock import RealClock
@@ -38,6 +39,7 @@ class Producer:
         self.end.setblocking(False)
         self.open = True
         self._unpack = frames.Unpacker()
+        self._saying = threading.Lock()
 
     def read(self) -> list[tuple[int, bytes]]:
         """The frames that came. ``open`` turns False when there will be no more."""
@@ -55,9 +57,42 @@ class Producer:
         return []
 
     def say(self, kind: int, body: bytes = b"") -> None:
-        """Send a frame unless the producer is gone or does not listen."""
-        with suppress(OSError):
+        """Send a frame unless the producer is gone or does not listen; from either thread."""
+        with self._saying, suppress(OSError):
             self.end.send(frames.pack(kind, body))
+
+
+class Alive:
+    """Tells the producers ten times a second that this process lives, and for how long its loop has been in one turn.
+
+    A thread of its own: a disk that keeps the loop waiting is told from a process that was stopped.
+    """
+
+    def __init__(self, producers: Sequence[Producer]) -> None:
+        self.free: int | None = None
+        self._producers = producers
+        self._clock = RealClock()
+        self._turn = self._clock.now()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="alive", daemon=True)
+        self._thread.start()
+
+    def turn(self) -> None:
+        """A new turn of the loop begins."""
+        self._turn = self._clock.now()
+
+    def _run(self) -> None:
+        while not self._end.wait(ALIVE_S):
+            free = -1 if self.free is None else self.free
+            state = frames.STATE.pack(free, self._clock.now() - self._turn)
+            for producer in self._producers:
+                if producer.open:
+                    producer.say(frames.ALIVE, state)
+
+    def close(self) -> None:
+        """End the thread."""
+        self._end.set()
+        self._thread.join()
 
 
 def serve(path: Path, ends: Sequence[socket.socket]) -> None:
@@ -66,7 +101,9 @@ def serve(path: Path, ends: Sequence[socket.socket]) -> None:
     try:
         with LogWriter(path) as log:
             producers[0].say(frames.READY)
-            if not _record(log, producers):
+            with closing(Alive(producers)) as alive:
+                recorded = _record(log, producers, alive)
+            if not recorded:
                 log.metadata("cut", {"reason": "what recorded this log ended without finishing it"})
                 return
         producers[0].say(frames.DONE)
@@ -81,13 +118,14 @@ def _fail(producers: Sequence[Producer], error: LogError) -> None:
         producer.say(frames.FAILED, json.dumps([str(error.path), error.what, error.advice]).encode())
 
 
-def _record(log: LogWriter, producers: Sequence[Producer]) -> bool:
+def _record(log: LogWriter, producers: Sequence[Producer], alive: Alive) -> bool:
     """Record until the log is finished (True) or everybody has gone."""
     clock = RealClock()
     outcome: dict[str, str] | None = None
-    give_up = next_alive = 0.0
+    give_up = 0.0
     while True:
         began = clock.now()
+        alive.turn()
         listening = [producer for producer in producers if producer.open]
         if outcome is not None and (not any(p.open for p in producers[1:]) or began > give_up):
             log.finish(outcome)
@@ -103,12 +141,8 @@ def _record(log: LogWriter, producers: Sequence[Producer]) -> bool:
                     outcome, give_up = json.loads(body), clock.now() + OTHERS_S
                 else:
                     _take(log, kind, body)
-        free = log.tick(clock.now())
+        alive.free = log.tick(clock.now())
         log.sync()
-        if began >= next_alive:
-            next_alive = began + ALIVE_S
-            for producer in listening:
-                producer.say(frames.ALIVE, frames.FREE.pack(-1 if free is None else free))
         clock.sleep_until(began + SHORTEST_TURN_S)  # many messages a turn cost less than a turn a message
 
 

@@ -19,6 +19,7 @@ from rig.log.part_file import PartFile
 # never has more than 100 ms of samples in memory.
 CHUNK_SECONDS = 0.08
 FREE_SECONDS = 1.0
+PLACE_SECONDS = 0.5  # how often it is looked whether the file is still where it was made
 
 
 class LogWriter:
@@ -57,6 +58,7 @@ class LogWriter:
         self._next_look = -math.inf
         self._channels: dict[str, int] = {}
         self._checks = Checks(path)
+        self._next_place = -math.inf
         self._chunk_since: float | None = None
         self._ended = False
         self._file = PartFile(path)
@@ -103,6 +105,9 @@ class LogWriter:
         Returns the bytes free on the disk, looked up once a second; None when the system does not tell.
         """
         self._file.check()
+        if now >= self._next_place:
+            self._next_place = now + PLACE_SECONDS
+            self._file.check_place()
         if now >= self._next_look:
             self._next_look = now + FREE_SECONDS
             with suppress(OSError):

@@ -8,20 +8,15 @@ for input.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import queue
 import select
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from rig.operator.signals import StopRequest
 
-MOST_LINES = 100  # that may wait to be shown
-PATIENCE_S = 0.5  # at the end, for what is left to be shown
 LOOK_S = 0.05  # how often keyboard and remote wishes are looked for
 STOP, PAUSE, CONTINUE = ("stop", "s", "q"), ("pause", "p"), ("continue", "c")
 HELP = "Type p to pause, c to continue, s to stop (and Enter); Ctrl-C stops too."
@@ -69,9 +64,7 @@ class Control(StopRequest):
         When nobody is there to be asked: why every question may be answered as expected, for the log ("--yes on the
         command line"). Empty when somebody is.
     say : callable
-        Shows one line to the operator.
-    slow : bool
-        Whether that may take long or for ever, as on a terminal that has been stopped: then nobody waits for it.
+        Shows one line to the operator; returns at once (`rig.operator.display.Display.say`).
 
     Attributes
     ----------
@@ -90,8 +83,6 @@ class Control(StopRequest):
         sources: Sequence[Source] = (),
         unattended: str = "",
         say: Callable[[str], None] = lambda text: None,
-        *,
-        slow: bool = False,
     ) -> None:
         super().__init__()
         self.unattended = unattended
@@ -100,8 +91,7 @@ class Control(StopRequest):
         self.answer: Answer | None = None
         self.doing = ""
         self._sources = tuple(sources)
-        self._voice = Voice(say) if slow else None
-        self._say = say if self._voice is None else self._voice.say
+        self._say = say
         self._next_look = 0.0
 
     def ask_pause(self, source: str) -> None:
@@ -176,39 +166,9 @@ class Control(StopRequest):
         }
 
     def close(self) -> None:
-        """Close every source, and let what was said be shown if that is possible soon."""
-        if self._voice is not None:
-            self._voice.close()
+        """Close every source."""
         for source in self._sources:
             source.close()
-
-
-class Voice:
-    """Says lines on a thread of its own: a terminal that takes nothing must not hold up the loop."""
-
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._lines: queue.Queue[str | None] = queue.Queue(maxsize=MOST_LINES)
-        self._out = say
-        self._thread = threading.Thread(target=self._run, name="voice", daemon=True)
-        self._thread.start()
-
-    def say(self, text: str) -> None:
-        """Say it when it can be said; dropped when too much waits already."""
-        with contextlib.suppress(queue.Full):
-            self._lines.put_nowait(text)
-
-    def _run(self) -> None:
-        while (text := self._lines.get()) is not None:
-            try:
-                self._out(text)
-            except Exception:  # the terminal is gone
-                return
-
-    def close(self) -> None:
-        """End the thread, waiting only shortly for what is left to be said."""
-        with contextlib.suppress(queue.Full):
-            self._lines.put_nowait(None)
-        self._thread.join(PATIENCE_S)
 
 
 def _is_expected(text: str, expected: str) -> bool:

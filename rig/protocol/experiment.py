@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from calibration.sensors.certificate import Certificate
+from drivers.settings import CanSettings
 from rig.base.certificates import load_certificate
 from rig.base.errors import ConfigError, LimitError
+from rig.log.contents import IN_MEMORY, ON_PORTS, ON_SERVED_PORTS, REPLAY_OF
 from rig.log.recorder import Gains
 from rig.protocol.plan import plan
 from rig.protocol.predict import Prediction, check_plan
@@ -16,6 +20,9 @@ from rig.scene.scene import Scene, load_scene
 from rig.steps.base import Action
 
 TIMES_BREAKDOWN = 10.0  # a limit of the field this far above breakdown is a slip of the unit
+# What ``dea-rig sim`` prints beside the ports, and where its pseudo-terminals are (Linux, macOS).
+SERVED_BY, SERVER = "served_by", {"program": "dea-rig sim"}
+PSEUDO_TERMINALS = ("/dev/pts/", "/dev/ttys")
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,25 @@ class Experiment:
     predictions: list[Prediction]
     resumed: dict[str, str] | None = None  # of which log this is the rest, for the log
     stored_zero: float | None = None  # of the force sensor, from the run that this one goes on with
+    served: bool = False  # the ports are those that ``dea-rig sim`` printed
+
+    @property
+    def bench(self) -> str:
+        """On what bench it runs, in the words of `rig.log.contents`.
+
+        Ports are simulated only when ``dea-rig sim`` printed them and they are the pseudo-terminals that it makes;
+        ports that somebody typed, into a scene or into a file, are real.
+        """
+        if self.scene.bench is not None:
+            return f"{REPLAY_OF}{Path(self.scene.bench.log).name}"
+        if not self.scene.on_real_ports:
+            return IN_MEMORY
+        return ON_SERVED_PORTS if self.served and _all_pseudo_terminals(self.scene) else ON_PORTS
+
+    @property
+    def highest_voltage(self) -> float:
+        """The highest voltage planned (V)."""
+        return max((level for action in self.actions for level in action.voltage), default=0.0)
 
     @property
     def duration(self) -> float:
@@ -64,7 +90,24 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
     predictions = check_plan(actions, scene, 0.0 if force is None else force.noise)
     _check_ranges(certificates, actions, predictions)
     _check_limits(scene, scene_path, certificates, actions)
-    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions)
+    served = ports is not None and are_served(ports)
+    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions, served=served)
+
+
+def are_served(ports: Mapping[str, object]) -> bool:
+    """Whether ``ports`` says that ``dea-rig sim`` printed it."""
+    return ports.get(SERVED_BY) == SERVER
+
+
+def _all_pseudo_terminals(scene: Scene) -> bool:
+    """Whether every port is a pseudo-terminal, behind whatever name."""
+    for table in scene.instruments.values():
+        name = getattr(table, "port", None)
+        if isinstance(table, CanSettings) and table.interface == "slcan":
+            name = table.can_channel
+        if name is None or not os.path.realpath(name).startswith(PSEUDO_TERMINALS):
+            return False
+    return True
 
 
 def certificates_of(scene: Scene, path: Path) -> dict[str, Certificate]:

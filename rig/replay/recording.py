@@ -14,7 +14,7 @@ from calibration.sensors.certificate import Certificate
 from rig.base.errors import ConfigError, LimitError
 from rig.base.toml_file import parse_table
 from rig.log import schema
-from rig.log.contents import ON_PORTS, certificates_in
+from rig.log.contents import ON_PORTS, ON_SERVED_PORTS, bench_of, certificates_in
 from rig.log.errors import LogError
 from rig.log.reader import Log, read_log
 from rig.protocol.experiment import Experiment
@@ -156,7 +156,7 @@ class Recording:
     @property
     def in_virtual_time(self) -> bool:
         """Whether the run's clock was a virtual one, so that its times come out the same again."""
-        return self.log.metadata.get("run", {}).get("bench") != ON_PORTS
+        return bench_of(self.log) not in (ON_PORTS, ON_SERVED_PORTS)
 
 
 def counted_device(topic: str, fields: Mapping[str, Any]) -> str:

@@ -19,9 +19,9 @@ from drivers.roles import Identity
 from rig.base.clock import VIRTUAL_EPOCH_NS, calendar_now
 from rig.base.errors import ConfigError
 from rig.base.toml_file import parse_table, validate
-from rig.log.contents import certificates_in, identities_in
+from rig.log.contents import IN_MEMORY, bench_of, bench_word, certificates_in, identities_in
 from rig.log.reader import Log, read_log
-from rig.protocol.experiment import Experiment
+from rig.protocol.experiment import Experiment, are_served
 from rig.protocol.plan import plan, plan_resumed
 from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
@@ -52,6 +52,7 @@ def prepare_resumed(
     protocol = parse_table(protocol_text, Protocol, "protocol", f"{path} (protocol.toml inside)")
     if ports is not None:
         scene = scene.with_ports(ports)
+    served = ports is not None and are_served(ports)
     scene = _with_serials(scene, identities_in(log), path)
     first = _next_step(log)
     if now_ns is None:
@@ -65,7 +66,7 @@ def prepare_resumed(
     certificates = _certificates(log)
     actions = plan_resumed(protocol, scene, first, still_valid, question)
     plan(protocol, scene)  # what is left must belong to a protocol that can be carried out
-    return Experiment(
+    experiment = Experiment(
         scene,
         scene_text,
         protocol,
@@ -81,6 +82,20 @@ def prepare_resumed(
             "preconditioning_still_valid": " ".join(map(str, sorted(still_valid))),
         },
         stored_zero=_force_zero(log),
+        served=served,
+    )
+    _check_bench(experiment, bench_of(log), path)
+    return experiment
+
+
+def _check_bench(experiment: Experiment, then: str, path: Path) -> None:
+    """A run goes on where it was begun."""
+    if then in ("", experiment.bench):
+        return
+    ports = " Name its ports with --ports." if experiment.bench == IN_MEMORY else ""
+    raise ConfigError(
+        f"{path}: this run was begun on another bench: {bench_word(then)} ({then}). Here it would go on with "
+        f"{bench_word(experiment.bench)} ({experiment.bench}).{ports} Nothing was touched."
     )
 
 

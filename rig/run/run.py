@@ -6,7 +6,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -15,14 +15,15 @@ from pathlib import Path
 
 from calibration.sensors.certificate import Certificate
 from rig.base.clock import Clock, calendar_now
-from rig.base.errors import FaultError, LimitError, NotSafe, Stopped
+from rig.base.errors import ConfigError, FaultError, LimitError, NotSafe, Stopped
 from rig.engine.engine import Engine
 from rig.engine.outcome import Outcome
 from rig.log import space
-from rig.log.contents import IN_MEMORY, ON_PORTS
+from rig.log.contents import IN_MEMORY, bench_word, is_real
 from rig.log.process import LogProcess
 from rig.log.recorder import Gains
 from rig.log.writer import LogWriter
+from rig.operator.awake import kept_awake
 from rig.operator.control import Control, Keyboard, Source
 from rig.operator.signals import stop_on_signals
 from rig.protocol.experiment import Experiment, gains_of
@@ -66,25 +67,34 @@ def run(
         What ended the run early; the rig has been made safe and the log finished by then, and the error carries the
         outcome as a note.
     """
-    space.check(out, experiment.duration, experiment.scene.rates)
+    bench_kind = experiment.bench
     in_memory = not experiment.scene.on_real_ports
     if consent is None:
         consent = Consent(IN_MEMORY, IN_MEMORY) if in_memory else Consent()
+    if is_real(bench_kind) and consent.answers and experiment.highest_voltage > 0:
+        raise ConfigError(
+            f"{bench_word(bench_kind)}: the highest voltage is typed by somebody who is there; {consent.answers} "
+            "cannot do that. It is for simulated benches: ports count as simulated when they come from the file that "
+            "`dea-rig sim` printed, by --ports. Nothing was touched."
+        )
+    space.check(out, experiment.duration, experiment.scene.rates)
     backend = Backend(experiment.scene)
     bench = backend.bench
+    engine: Engine | None = None
     outcome: Outcome | None = None
+    log: LogWriter | LogProcess | None = None
     try:
         problems = _check_dates(experiment.certificates, bench.clock)
         with (
-            _log(out, experiment.scene) as log,
-            closing(Control([] if in_memory else _sources(out), consent.answers, say, slow=not in_memory)) as control,
+            closing(Control([] if in_memory else _sources(out), consent.answers, say)) as control,
             stop_on_signals(control, control.ask_pause),
+            _log(out, experiment.scene) as log,
+            _awake(experiment, bench_kind) as awake,
         ):
             _attach(log, experiment, problems, _this_origin() if origin is None else origin)
             if backend.guard is not None and isinstance(log, LogProcess):
                 backend.guard.log_to(out, log.second)
                 log.second.close()
-            certificates = experiment.certificates
             engine = Engine(
                 bench,
                 experiment.actions,
@@ -92,11 +102,13 @@ def run(
                 _gains(experiment),
                 control,
                 progress,
-                certificates,
+                experiment.certificates,
                 requested=consent.arm,
                 take_down=consent.take_down,
                 guard_process=backend.guard,
             )
+            if awake:
+                engine.recorder.event("info", "host", awake)
             outcome, error = engine.run()
             bench.close()  # before the log ends: closing a device may say a last word on its wire
             if not engine.recorder.log_failed:
@@ -106,11 +118,11 @@ def run(
         if not (outcome.safe and outcome.standing):
             raise worst(outcome, None)
     except Exception as error:
-        if outcome is None:
-            raise
-        told = worst(outcome, error)
-        told.add_note(f"The log so far: {out if out.exists() else log.part}")
-        told.add_note(f"State of the rig: {outcome.state}.")  # the last line: whatever else is said, this is seen
+        told = worst(outcome, error) if outcome is not None else _unended(error, engine)
+        if log is not None and (found := next((file for file in (out, log.part) if file.exists()), None)) is not None:
+            told.add_note(f"The log so far: {found}")
+        if outcome is not None:  # the last line: whatever else is said, this is seen
+            told.add_note(f"State of the rig: {outcome.state}.{'' if outcome.safe else ' ' + ADVICE}")
         if told is error:
             raise
         raise told from error
@@ -134,6 +146,21 @@ def worst(outcome: Outcome, error: Exception | None) -> Exception:
         return FaultError(f"{words} {ended}", device="stage", cause=outcome.reason)
     assert error is not None
     return error
+
+
+def _unended(error: Exception, engine: Engine | None) -> Exception:
+    """What is told when not even the way to the safe state came to its end: by what the guard knows."""
+    guard = engine.guard if engine is not None else None
+    if guard is None or not guard.commanded or guard.output_is_safe:
+        return error
+    return NotSafe(f"{NOT_SAFE} {ADVICE} What ended the run: {error!r}", device="hv", cause=repr(error))
+
+
+def _awake(experiment: Experiment, bench_kind: str) -> AbstractContextManager[str]:
+    """Keeps the computer from sleeping while there may be voltage on real ports."""
+    if is_real(bench_kind) and experiment.highest_voltage > 0:
+        return kept_awake(f"high voltage on {experiment.scene.specimen.name}")
+    return nullcontext("")
 
 
 def _sources(out: Path) -> list[Source]:
@@ -160,12 +187,6 @@ def _log(out: Path, scene: Scene) -> LogWriter | LogProcess:
     if scene.on_real_ports and os.name == "posix":
         return LogProcess(out)
     return LogWriter(out)
-
-
-def _bench(scene: Scene) -> str:
-    if scene.bench is not None:
-        return f"replay of {Path(scene.bench.log).name}"
-    return ON_PORTS if scene.on_real_ports else IN_MEMORY
 
 
 @cache
@@ -200,7 +221,7 @@ def _attach(
             "scene": experiment.scene.title,
             "protocol": experiment.protocol.title,
             "specimen": experiment.scene.specimen.name,
-            "bench": _bench(experiment.scene),
+            "bench": experiment.bench,
             "without_certificate": " ".join(role for role in uncalibrated if role != "stage"),
             "certificate_problems": "; ".join(problems),
         },

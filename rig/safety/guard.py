@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from drivers.roles import HVFlag, HVSample, HVSupply, Renewed
 from rig.base.errors import FaultError, LimitError, StaleData
+from rig.safety.commanded import DEVIATION_PART, DEVIATION_V, CommandedRamp
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limit, Limits
 
@@ -25,9 +26,8 @@ if TYPE_CHECKING:
 AnyGuard: TypeAlias = "Guard | RemoteGuard"  # in the engine's process, or in one of its own
 
 SAFE_VOLTAGE = 60.0  # V; below this the discharge is harmless (EN 50191 names 60 V DC)
-DEVIATION_V, DEVIATION_PART = 50.0, 0.05  # a settled output this far from its set-point has sagged or risen ...
-AWAY_V = 3.0  # ... and so has one on its way that moves away from there by more than this from sample to sample ...
-DEVIATION_SAMPLES = 2  # ... when this many samples in a row say so
+AWAY_V = 3.0  # an output outside what its ramp allows that moves away by more than this from sample to sample ...
+DEVIATION_SAMPLES = 2  # ... and so many samples in a row that show it outside, are a fault
 FROZEN_SAMPLES = 25  # this many equal measurements of voltage and current in a row: last digits are never so quiet
 FROZEN_RAMP_V, FROZEN_RAMP_SAMPLES = 100.0, 3  # nor does a ramp over so much leave so many voltages equal
 FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
@@ -98,6 +98,7 @@ class Guard:
         self._equal_samples = 0
         self._equal_since: tuple[HVSample, bool] | None = None  # and whether the output was to move
         self._seen_on = False
+        self._commanded: CommandedRamp | None = None  # what the output was last told to do, but for an emergency off
         self._charge: tuple[float, float] | None = None  # time (s) and charge on the film (C) at the last sample
         self._leaking_samples = 0
         self.last: HVSample | None = None
@@ -187,6 +188,7 @@ class Guard:
         """Ramp down and switch off an output that was found live, by the operator's choice; the latch stays SAFE."""
         self.commanded = self.ramps_down = True
         self._low_samples = 0
+        self._expect(0.0)
         try:
             self._tell("take_down", f"ramp {self._ramp!r} V/s; {cause}")
         finally:
@@ -224,12 +226,21 @@ class Guard:
             self._film.check(where, volts, f"HV set-point {volts:g} V at {where * 1e3:.2f} mm")
         self._tell("set_voltage", f"{volts!r} V")
         self.setpoint = volts
+        self._expect(volts)
         self._supply.set_voltage(volts)
         if self.state is GuardState.ARMED:
             self._tell("switch_on", "")
             self._supply.switch_on()
             self.state = GuardState.LIVE
         self._low_samples = 0
+
+    def _expect(self, volts: float) -> None:
+        """From here on the output is held against a ramp to ``volts``."""
+        if self.last is None or not math.isfinite(self.last.voltage):
+            self._commanded = None
+        else:
+            before = self._commanded.target if self._commanded is not None else self.last.voltage
+            self._commanded = CommandedRamp(self.last.t, self.last.voltage, volts, self._ramp, before)
 
     def check_move(self, h0: float, h1: float) -> None:
         """Ask before the disk is moved from displacement ``h0`` to ``h1`` metres.
@@ -336,6 +347,8 @@ class Guard:
         if self.commanded and not below:
             self._judge_frozen(sample)
         if self.state is not GuardState.LIVE:
+            if self.ramps_down and self.commanded and not self.output_is_safe:
+                self._judge_ramp_down(sample)
             return
         self._limits.measured_voltage.check(sample.voltage, "HV monitor")
         if self._supply.measures_current:
@@ -392,32 +405,61 @@ class Guard:
             )
 
     def _judge_deviation(self, sample: HVSample, before: HVSample | None) -> None:
-        """The output must be on, at the set-point that was asked for or on its way there; two samples in a row that
-        say no are a fault."""
+        """The output must be on, and where the commanded ramp has it; two samples in a row that say no are a fault.
+
+        That the supply says of itself that it is ramping excuses nothing.
+        """
         on = HVFlag.ON in sample.flags
         self._seen_on = self._seen_on or on
-        heard = on and not self._supply.busy
-        settled = heard and HVFlag.RAMPING not in sample.flags
-        allowed = max(DEVIATION_V, DEVIATION_PART * self.setpoint)
-        missing = abs(sample.voltage - self.setpoint)
-        goes_away = before is not None and missing > abs(before.voltage - self.setpoint) + AWAY_V
+        settled = on and not self._supply.busy and HVFlag.RAMPING not in sample.flags
         problem = ""
         if self._seen_on and not on:
             problem = "the supply says that it is off, and nobody switched it off from here"
         elif settled and not math.isclose(sample.setpoint, self.setpoint, rel_tol=1e-3, abs_tol=1.0):
             problem = f"its set-point is {sample.setpoint:.0f} V, and {self.setpoint:.0f} V were asked for from here"
-        elif (settled or (heard and goes_away)) and not missing <= allowed:
-            word = "sagged" if sample.voltage < self.setpoint else "risen"
-            problem = f"the output has {word} to {sample.voltage:.0f} V with {self.setpoint:.0f} V set"
+        else:
+            problem = self._off_its_ramp(sample, before, settled=settled)
         self._deviating_samples = self._deviating_samples + 1 if problem else 0
         if self._deviating_samples >= DEVIATION_SAMPLES:
             raise FaultError(f"hv: {problem}.")
+
+    def _off_its_ramp(self, sample: HVSample, before: HVSample | None, *, settled: bool) -> str:
+        """What is wrong with the voltage, held against the commanded ramp; empty if nothing is."""
+        if self._commanded is None:
+            return f"the output is at {sample.voltage:.0f} V, and it was never measured before it was commanded"
+        self._commanded.confirm(sample.t, busy=self._supply.busy)
+        least, most = self._commanded.band(sample.t)
+        missing = abs(sample.voltage - self.setpoint)
+        allowed = max(DEVIATION_V, DEVIATION_PART * self.setpoint)
+        heard = HVFlag.ON in sample.flags and not self._supply.busy
+        goes_away = heard and before is not None and missing > abs(before.voltage - self.setpoint) + AWAY_V
+        inside = least <= sample.voltage <= most and not ((settled or goes_away) and not missing <= allowed)
+        if inside:
+            return ""
+        ahead = most < sample.voltage < self.setpoint or self.setpoint < sample.voltage < least
+        word = "run ahead of its ramp" if ahead else "sagged" if sample.voltage < self.setpoint else "risen"
+        return (
+            f"the output has {word} to {sample.voltage:.0f} V with {self.setpoint:.0f} V set; the commanded ramp has "
+            f"it between {least:.0f} and {most:.0f} V"
+        )
+
+    def _judge_ramp_down(self, sample: HVSample) -> None:
+        """An output that does not come down as commanded is not waited for."""
+        if self._commanded is None:
+            return
+        self._commanded.confirm(sample.t, busy=self._supply.busy)
+        _, most = self._commanded.band(sample.t)
+        self._deviating_samples = self._deviating_samples + 1 if not sample.voltage <= most else 0
+        if self._deviating_samples >= DEVIATION_SAMPLES:
+            self._deviating_samples = 0
+            raise FaultError(f"hv: the output is at {sample.voltage:.0f} V, its ramp down has it below {most:.0f} V.")
 
     def ramp_off(self, cause: str) -> None:
         """Ramp the output down, switch it off and latch SAFE. For orderly ends; does nothing unless armed or live."""
         if self.state is GuardState.SAFE:
             return
         self._latch(cause, ramps_down=True)
+        self._expect(0.0)
         try:
             self._tell("switch_off", cause)
         finally:
@@ -438,7 +480,7 @@ class Guard:
         self.ramps_down = ramps_down
         self.cause = cause
         self.setpoint = 0.0
-        self._low_samples = 0
+        self._low_samples = self._deviating_samples = 0
 
 
 def ramp_limit(duration: float) -> float:

@@ -146,7 +146,7 @@ class Server:
         self._off_limit = 0.0  # ... after which time it must be measured off
         self._off_ramps = False  # ... and whether that was an orderly ramp
         self._lost_at: float | None = None  # since when the link has been gone
-        self._voice = Voice()
+        self._words = LastWords()
         self._told_not_safe = False
         self._dismissed = False
 
@@ -218,7 +218,7 @@ class Server:
 
     def _wait(self) -> None:
         now = self._clock.now()
-        self._voice.speak()
+        self._words.speak()
         self._tick_log(now)
         due = self._supply.next_poll if self._supply is not None else now + LONGEST_TURN_S
         wait = min(max(due - now, SHORTEST_TURN_S), LONGEST_TURN_S)
@@ -232,10 +232,10 @@ class Server:
         guard = self._guard
         if guard is not None and guard.state is not GuardState.SAFE:
             self._off(guard, str(error) or repr(error))
-        elif guard is not None and guard.commanded and not guard.output_is_safe and isinstance(error, DeviceError):
-            if guard.ramps_down:  # the switch-off may be what failed
+        elif guard is not None and guard.commanded and not guard.output_is_safe:
+            if guard.ramps_down:  # the switch-off may be what failed, or the output does not come down
                 self._off(guard, f"{guard.cause}; hastened, {error}")
-            else:
+            elif isinstance(error, DeviceError):
                 self._again = min(self._again, self._clock.now() + AGAIN_S)
         self._channel.send({"is": "error", "error": pack_error(error)})
         if guard is not None:  # the turn that failed has not come so far
@@ -270,7 +270,7 @@ class Server:
             self._told_not_safe = True
             message = f"{NOT_SAFE} {ADVICE}"
             self._tell_event("error", message)
-            self._voice.say(f"dea-rig guard: {message} It is told again until it obeys (process {os.getpid()}).")
+            self._words.say(f"dea-rig guard: {message} It is told again until it obeys (process {os.getpid()}).")
         elif now >= self._again:
             self._again = now + INSIST_S
             self._off(guard, guard.cause)
@@ -412,9 +412,9 @@ class Server:
         else:
             message = f"{cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {ADVICE} The guard has ended."
         self._tell_event("error", message)
-        self._voice.say(f"dea-rig guard: {message}")
+        self._words.say(f"dea-rig guard: {message}")
         end = time.monotonic() + SPEAK_S
-        while not self._voice.speak() and time.monotonic() < end:
+        while not self._words.speak() and time.monotonic() < end:
             time.sleep(LONGEST_TURN_S)
 
 
@@ -430,7 +430,7 @@ def _measured_off(guard: Guard) -> bool:
     return guard.state is GuardState.SAFE and guard.output_is_safe
 
 
-class Voice:
+class LastWords:
     """To the terminal, if there still is one. One that takes nothing (stopped by Ctrl-S) holds nobody up."""
 
     def __init__(self) -> None:

@@ -71,6 +71,10 @@ class ServedBench:
             raise answer
         return answer
 
+    def stall(self, role: str, stalled: bool) -> None:
+        """Let the adapter of an instrument hang, or work again."""
+        self.do(lambda bench: self._server.stall(role, stalled))
+
     def voltage(self) -> float:
         """The supply's true output now (V)."""
         return self.do(lambda bench: bench.world.output.at(bench.now)[0])

@@ -50,6 +50,7 @@ class _Port:
         self.line = line
         self.wire = wire
         self.lost_bytes = 0
+        self.stalled = False  # a fault: an adapter that hangs, takes nothing and gives nothing
         self.master = -1
         self._slave = -1
         self.open()
@@ -94,6 +95,7 @@ class _TcpPort:
         self.line = line
         self.wire = wire
         self.lost_bytes = 0
+        self.stalled = False  # as `_Port` has it
         self._listening = socket.create_server(("127.0.0.1", 0), backlog=2)
         self._listening.setblocking(False)
         self.number = int(self._listening.getsockname()[1])
@@ -206,6 +208,10 @@ class Server:
             for role, port in self._ports.items()
         }
 
+    def stall(self, role: str, stalled: bool) -> None:
+        """Let the adapter of an instrument hang, or work again."""
+        self._ports[role].stalled = stalled
+
     def run(self, stop: Callable[[], bool], look: Callable[[], None] = lambda: None) -> None:
         """Serve until ``stop()`` is true; it is asked at least every 50 ms. ``look`` is called each time too."""
         start = self._clock.now() - self._bench.now
@@ -215,7 +221,7 @@ class Server:
             look()
             for port in self._ports.values():
                 self._hand_over(port, now)
-            open_ports = {port.master: port for port in self._ports.values() if port.is_open}
+            open_ports = {port.master: port for port in self._ports.values() if port.is_open and not port.stalled}
             wait = min(max(self._bench.next_time() - now, STEP_S), IDLE_S)
             ready, _, _ = select.select(list(open_ports), [], [], wait)
             if ready:
@@ -231,7 +237,7 @@ class Server:
         if not port.is_open:
             port.open()
         data = port.line.host_read(now)
-        if data:
+        if data and not port.stalled:
             port.write(data)
 
     def _take(self, port: _Port | _TcpPort, now: float) -> None:

@@ -18,7 +18,7 @@ from rig.safety import process
 from rig.safety.channel import Channel
 from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
 from rig.safety.heartbeat import Heartbeat
-from rig.safety.process import Server, Voice
+from rig.safety.process import LastWords, Server
 from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.truth import Fault
@@ -260,7 +260,7 @@ def test_a_terminal_that_was_stopped_holds_nobody_up(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(process, "STDERR", terminal)
     try:
         termios.tcflow(terminal, termios.TCOOFF)  # Ctrl-S
-        voice = Voice()
+        voice = LastWords()
         voice.say("NOT SAFE")
         assert not voice.speak()
         termios.tcflow(terminal, termios.TCOON)

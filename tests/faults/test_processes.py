@@ -234,7 +234,7 @@ def test_a_guard_whose_engine_takes_leave_of_a_live_output_stays_and_tries_on(st
     assert "before the output was measured off" in live.said and "The high voltage is off, measured" in live.said
     outcome = read_log(live.log).outcome
     assert live.status == 4 and outcome is not None
-    assert (outcome["safe"], outcome["status"]) == ("NO", "not safe") and outcome["reason"].startswith("stopped by")
+    assert (outcome["safe"], outcome["status"]) == ("NO", "NOT SAFE") and outcome["reason"].startswith("stopped by")
 
 
 @pytest.mark.slow

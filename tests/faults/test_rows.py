@@ -52,6 +52,7 @@ ROWS: dict[int, Row] = {
         [
             "faults/test_processes.py::test_guard_killed",
             "faults/test_processes.py::test_guard_that_hangs_is_ended_and_replaced_by_the_engine",
+            "faults/test_hanging.py::test_taking_over_needs_no_lock_no_file_and_no_descriptor",
             "faults/test_serial_supply.py::test_killed",
         ],
     ),
@@ -198,7 +199,7 @@ ROWS: dict[int, Row] = {
         "a certificate is out of date, or another instrument's",
         "told in the log, or refused",
         [
-            "calibration/sensors/test_certificate.py::test_expired_not_yet_valid_and_mismatched",
+            "rig/base/test_certificates.py::test_expired_not_yet_valid_and_mismatched",
             "faults/test_run_ends_safe.py::test_a_certificate_of_another_sensor_is_told_in_the_log",
         ],
     ),
@@ -220,6 +221,68 @@ ROWS: dict[int, Row] = {
             "test_a_supply_found_live_is_left_alone_while_the_operator_thinks_and_when_he_stops",
         ],
     ),
+    24: (
+        "a port that never says that it has sent; an adapter that takes nothing",
+        "no call in the loops waits; lost and said within a second, NOT SAFE within five, signals work",
+        [
+            "faults/test_hanging.py::test_nothing_waits_for_a_port_to_send",
+            "faults/test_hanging.py::test_an_adapter_that_takes_nothing_is_lost_and_said",
+            "faults/test_hanging.py::test_signals_work_while_the_adapter_takes_nothing",
+            "drivers/links/test_serial_link.py::test_stalled_peer_is_told_within_a_second_instead_of_waited_for",
+        ],
+    ),
+    25: (
+        "an adapter is pulled, and back under its name",
+        "found again by name and serial number, off within a second of its return",
+        [
+            "faults/test_processes.py::"
+            "test_an_adapter_that_is_pulled_and_comes_back_is_found_again_and_the_output_taken_off",
+            "faults/test_processes.py::"
+            "test_a_guard_killed_while_the_adapter_is_out_leaves_the_engine_to_take_the_output_off",
+            "drivers/links/test_serial_link.py::test_a_port_that_comes_back_under_its_name_is_opened_again",
+            "drivers/links/test_serial_link.py::test_another_adapter_under_the_same_name_is_left_alone",
+        ],
+    ),
+    26: (
+        "an output that creeps, jumps or stays, and says that it ramps",
+        "held against the commanded ramp at all times",
+        [
+            "faults/test_hanging.py::test_an_output_that_creeps_and_says_ramping_is_taken_off",
+            "rig/safety/test_guard.py::test_an_output_that_creeps_is_a_fault_whatever_the_supply_says_of_itself",
+            "rig/safety/test_guard.py::"
+            "test_an_output_that_jumps_past_its_ramp_is_a_fault_though_it_is_below_its_set_point",
+            "rig/safety/test_guard.py::test_a_ramp_down_that_does_not_come_down_is_not_waited_for",
+            "rig/safety/test_commanded.py::test_an_output_that_follows_its_ramps_stays_inside",
+        ],
+    ),
+    27: (
+        "a run ends in whatever way with an output that was not measured off",
+        "exit code 4, status and last line NOT SAFE, and never otherwise",
+        [
+            "faults/test_exit_paths.py::test_not_safe_is_never_hidden",
+            "faults/test_exit_paths.py::test_and_never_said_otherwise",
+        ],
+    ),
+    28: (
+        "real ports taken for simulated ones",
+        "--yes never arms them; SIMULATED or REAL PORTS first; no other bench on resuming or in one fit",
+        [
+            "rig/run/test_what_is_real.py::test_only_pseudo_terminals_that_the_simulation_printed_are_simulated",
+            "rig/run/test_what_is_real.py::test_yes_never_arms_real_ports",
+            "rig/run/test_what_is_real.py::test_a_run_is_not_taken_up_on_another_bench",
+            "rig/run/test_what_is_real.py::test_logs_of_hardware_and_simulated_ones_are_not_fitted_together",
+        ],
+    ),
+    29: (
+        "the log is deleted, its writer hangs, the terminal takes nothing, the bus is full",
+        "safe within a second, the log saved, no process left behind; nothing waits",
+        [
+            "faults/test_hanging.py::test_a_log_that_is_deleted_ends_the_run_at_once_and_is_saved",
+            "faults/test_hanging.py::test_a_writer_that_hangs_ends_the_run_and_is_not_left_behind",
+            "faults/test_hanging.py::test_a_pipe_that_nobody_reads_holds_up_neither_the_run_nor_its_end",
+            "faults/test_hanging.py::test_a_bus_full_of_other_frames_delays_nothing",
+        ],
+    ),
 }
 
 
@@ -229,8 +292,8 @@ def names_in(path: str) -> frozenset[str]:
     return frozenset(node.name for node in tree.body if isinstance(node, ast.FunctionDef))
 
 
-def test_there_are_23_rows() -> None:
-    assert sorted(ROWS) == list(range(1, 24))
+def test_there_are_29_rows() -> None:
+    assert sorted(ROWS) == list(range(1, 30))
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row}: {ROWS[row][0]}")

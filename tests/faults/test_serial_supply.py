@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from rig.benchmark.stand import PROTOCOL
+from rig.protocol.experiment import SERVED_BY, SERVER
 from rig.run.backend import simulated_bench
 from rig.scene.scene import load_scene
 from rig.sim.served import ServedBench
@@ -48,7 +49,7 @@ def test_killed(tmp_path: Path, who: str) -> None:
     scene.write_text(text.replace("../calibrations", str(FIXTURES / "calibrations")))
     protocol.write_text(PROTOCOL.replace("HOLD_S", "60"))
     with ServedBench(simulated_bench(load_scene(scene)[0])) as bench, (tmp_path / "said").open("w+b") as said:
-        ports.write_text(json.dumps(dict(bench.ports)))
+        ports.write_text(json.dumps({**bench.ports, SERVED_BY: SERVER}))
         command = [sys.executable, "-m", "rig", "run", scene, protocol, "-o", tmp_path / "run.mcap", "--ports", ports]
         engine = subprocess.Popen([*command, "--arm", "--yes"], stderr=said, stdout=said)
 

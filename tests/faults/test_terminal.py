@@ -14,6 +14,7 @@ import pytest
 
 from rig.benchmark.stand import Stand
 from rig.log.reader import Log, read_log
+from rig.protocol.experiment import SERVED_BY, SERVER
 
 pytestmark = [pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX"), pytest.mark.slow]
 
@@ -34,7 +35,7 @@ class Terminal:
         self.stand, self.log = stand, log
         stand.bench.power_cycle()
         ports = log.with_suffix(".json")
-        ports.write_text(json.dumps(dict(stand.bench.ports)))
+        ports.write_text(json.dumps({**stand.bench.ports, SERVED_BY: SERVER}))
         self.master, slave = os.openpty()
         os.set_blocking(self.master, False)
         command = [sys.executable, "-m", "rig", "run", str(stand.scene), str(stand.protocol), "-o", str(log)]

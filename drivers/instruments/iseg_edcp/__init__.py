@@ -41,6 +41,11 @@ class IsegSettings(SupplySettings, CanSettings):
         le=100,
         description="Fastest voltage ramp that the module takes, in percent of its nominal voltage per second.",
     )
+    status_bit_5: Literal["unused", "limit good", "input error"] = Field(
+        default="unused",
+        description="What bit 5 of the module status says: nothing on most modules; that the hardware voltage limit is "
+        "good on distributor modules with current mirror (EHQ); an input error on some others. See its manual.",
+    )
     poll_rate_Hz: float = Field(
         default=10.0, gt=0, le=50, description="How often voltage, current and status are read (Hz). Typical: 10."
     )

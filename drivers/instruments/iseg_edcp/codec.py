@@ -165,6 +165,9 @@ class ChannelControl(IntFlag):
     ON = 1 << 3
 
 
+# The bits of the channel control that this program sets and clears; the others are somebody else's and stay as found.
+OWN_CONTROL = int(ChannelControl.ON | ChannelControl.EMERGENCY_OFF)
+
 # Events that keep the channel from being switched on until they are cleared.
 BLOCKING = (
     ChannelEvents.VOLTAGE_LIMIT
@@ -290,11 +293,19 @@ class Decoder:
         return None
 
 
-def hv_flags(status: ChannelStatus, events: ChannelEvents, module: ModuleStatus) -> HVFlag:
+STATUS_BIT_5 = ("unused", "limit good", "input error")
+"""What bit 5 of the module status may mean, by the class of the module."""
+
+
+def hv_flags(status: ChannelStatus, events: ChannelEvents, module: ModuleStatus, bit_5: str = "unused") -> HVFlag:
     """What a channel's status, its latched events and its module's status mean for any supply.
 
-    Latched events that block the channel count as present until they are cleared.
+    Latched events that block the channel count as present until they are cleared. ``bit_5``, one of `STATUS_BIT_5`,
+    says what bit 5 of the module status means: "hardware voltage limit good" on distributor modules with current
+    mirror, an input error (1 = bad) on some others; it is reserved on most.
     """
+    limit_bit = module & ModuleStatus.HARDWARE_VOLTAGE_LIMIT_GOOD
+    bit_5_is_bad = (bit_5 == "limit good" and not limit_bit) or (bit_5 == "input error" and bool(limit_bit))
     flags = HVFlag(0)
     for flag, present in (
         (HVFlag.ON, status & ChannelStatus.ON),
@@ -317,13 +328,8 @@ def hv_flags(status: ChannelStatus, events: ChannelEvents, module: ModuleStatus)
         (
             HVFlag.FAULT,
             status & ChannelStatus.INPUT_ERROR
-            or ~module
-            & (
-                ModuleStatus.TEMPERATURE_GOOD
-                | ModuleStatus.SUPPLY_GOOD
-                | ModuleStatus.MODULE_GOOD
-                | ModuleStatus.HARDWARE_VOLTAGE_LIMIT_GOOD
-            ),
+            or bit_5_is_bad
+            or ~module & (ModuleStatus.TEMPERATURE_GOOD | ModuleStatus.SUPPLY_GOOD | ModuleStatus.MODULE_GOOD),
         ),
     ):
         if present:

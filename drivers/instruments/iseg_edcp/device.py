@@ -27,9 +27,11 @@ from drivers.instruments.iseg_edcp.codec import (
     MODULE_STATUS,
     NOMINAL_CURRENT,
     NOMINAL_VOLTAGE,
+    OWN_CONTROL,
     SERIAL_NUMBER,
     SET_CURRENT,
     SET_VOLTAGE,
+    STATUS_BIT_5,
     TRIP_ACTION,
     TRIP_ACTIONS,
     TRIP_DELAY,
@@ -78,6 +80,9 @@ Script = Generator[Ask[_Exchange], Answer[Message], T]
 
 _ATTEMPTS = 3
 _SURVEY_S = 1.0  # how often the other channels of the module are looked at
+_EMERGENCY_OFTEN, _EMERGENCY_SELDOM_S = 50, 0.1  # ... after so many at this one
+_EMERGENCY_LOOKS = 5
+_EMERGENCY_AGAIN_S = 0.01  # an emergency off that is not confirmed goes out again at this interval
 _SWITCH_ON_LOOKS, _SWITCH_ON_WAIT_S = 5, 0.02
 
 
@@ -89,10 +94,12 @@ class IsegEDCP:
     set-point, channel status and events) and one of the module's status; they also keep the registration alive. If
     the module has other channels, their status is read once a second into ``channel_status``.
 
-    A command writes and reads back; a write that got lost is repeated, except switching on. A command that fails
-    raises from ``poll`` and takes the commands queued behind it with it. ``emergency_off`` drops whatever is queued or
-    under way and is sent by the next poll, answered or not; if it is not confirmed, all modules on the bus are told.
-    ``switch_off`` drops it too, except a ramp that was asked for, which is written first.
+    A command writes and reads back; a write that got lost is repeated, except switching on. A command that fails raises
+    from ``poll`` and takes the commands queued behind it with it. ``emergency_off`` drops whatever is queued or under
+    way, is the first thing that the next poll does, and goes out again every 10 ms until it is confirmed; if that
+    fails, all modules on the bus are told. ``switch_off`` drops what is queued too, except a ramp that was asked for,
+    which is written first. Of the channel control only this driver's own bits are changed and compared. A negative
+    channel is used like a positive one: its voltages are magnitudes here.
 
     Parameters
     ----------
@@ -104,6 +111,8 @@ class IsegEDCP:
         How long to wait for each answer; a read is repeated twice.
     max_ramp_percent_per_s : float
         Fastest voltage ramp that the module accepts, in percent of its nominal voltage per second.
+    status_bit_5 : str
+        One of `STATUS_BIT_5`: what bit 5 of the module status means for this class of module.
     """
 
     measures_current = True
@@ -118,6 +127,7 @@ class IsegEDCP:
         poll_rate_Hz: float = 10.0,
         timeout_s: float = 0.25,
         max_ramp_percent_per_s: float = 20.0,
+        status_bit_5: str = "unused",
     ) -> None:
         where = label(name, link)
         if not 0 <= module <= 63:
@@ -128,8 +138,16 @@ class IsegEDCP:
             )
         if not 0 < poll_rate_Hz <= 100:
             raise DeviceRefused(where, f"poll rate {poll_rate_Hz} Hz is not possible", "Allowed: above 0, at most 100.")
+        if status_bit_5 not in STATUS_BIT_5:
+            allowed = ", ".join(STATUS_BIT_5)
+            raise DeviceRefused(where, f"status_bit_5 {status_bit_5!r} is not known", f"Allowed: {allowed}.")
         self.name = name
         self._label = where
+        self._bit_5 = status_bit_5
+        self._sign = 1.0  # of the channel's nominal voltage
+        self._control = 0  # the channel's control word as last read
+        self._emergency_until_confirmed = False
+        self._next_emergency, self._emergencies = -math.inf, 0
         self.identity = Identity(model="iseg EDCP")
         self.settings: dict[str, str] = {}
         self.counters: dict[str, int] = {"log_ons": 0, "unexpected_frames": 0, "bad_values": 0, "writes_repeated": 0}
@@ -216,10 +234,11 @@ class IsegEDCP:
                 f"a set-point of {volts:g} V is outside the channel's range",
                 f"Allowed: 0 to {self._nominal[0]:g} V.",
             )
-        self._command(self._write_checked(SET_VOLTAGE, volts, self._channel))
+        self._command(self._write_checked(SET_VOLTAGE, self._sign * volts, self._channel))
 
     def switch_on(self) -> None:
         self._require_ready("switch on")
+        self._emergency_until_confirmed = False
         self._command(self._switch_on())
 
     def switch_off(self) -> None:
@@ -231,9 +250,11 @@ class IsegEDCP:
         self._dialogue.clear()
         self._commands = 0
         self._wanted_ramp = None
+        self._emergency_until_confirmed, self._next_emergency, self._emergencies = True, -math.inf, 0
         self._command(self._emergency_off())
 
     def clear(self) -> None:
+        self._emergency_until_confirmed = False
         self._command(self._clear())
 
     def close(self) -> None:
@@ -271,6 +292,7 @@ class IsegEDCP:
 
     def poll(self, now: float) -> Sequence[HVSample]:
         self._next_poll = now + LOST_AGAIN_S
+        self._repeat_emergency_off(now)
         self._inbox.extend(self._link.read())
         while self._inbox:  # an error that an answer brings on leaves the others for the next poll
             message = self._decoder.feed(self._inbox.popleft())
@@ -290,8 +312,19 @@ class IsegEDCP:
         if self._ready and math.isinf(self._schedule.due):
             self._schedule.start(now)
         self._next_poll = min(self._schedule.due if self._dialogue.idle else math.inf, self._dialogue.next_poll(now))
+        if self._emergency_until_confirmed:
+            self._next_poll = min(self._next_poll, self._next_emergency)
         samples, self._samples = self._samples, []
         return samples
+
+    def _repeat_emergency_off(self, now: float) -> None:
+        """Before anything is read: what comes in must not hold it up."""
+        if self._emergency_until_confirmed and now >= self._next_emergency:
+            self._emergencies += 1
+            often = self._emergencies < _EMERGENCY_OFTEN
+            self._next_emergency = now + (_EMERGENCY_AGAIN_S if often else _EMERGENCY_SELDOM_S)
+            word = self._control & ~OWN_CONTROL | ChannelControl.EMERGENCY_OFF
+            self._link.write(write(self._module, CHANNEL_CONTROL, word, self._channel))
 
     def _command(self, script: Script[None]) -> None:
         self._commands += 1
@@ -401,17 +434,21 @@ class IsegEDCP:
         self.identity = identity(serial, release, firmware)
         volts, _ = yield from self._number(NOMINAL_VOLTAGE, 1e6)
         amperes, _ = yield from self._number(NOMINAL_CURRENT, 1e3)
-        if not (volts > 0 and amperes > 0):
+        if not (volts != 0 and amperes != 0):
             raise DeviceRefused(
                 self._label,
                 f"states nominal values of {volts:g} V and {amperes:g} A",
-                "Only positive ones are supported.",
+                "Check the channel: it may have no output stage.",
             )
+        self._sign = math.copysign(1.0, volts)
+        volts, amperes = abs(volts), abs(amperes)
         self._nominal = (volts, amperes)
         yield from self._read_settings()
         setpoint, _ = yield from self._number(SET_VOLTAGE, 2 * volts)
         status = yield from self._integer(CHANNEL_STATUS)
+        self._control = yield from self._integer(CHANNEL_CONTROL)
         self.settings |= {
+            "polarity": "positive" if self._sign > 0 else "negative",
             "nominal_voltage_V": f"{volts:.9g}",
             "nominal_current_A": f"{amperes:.9g}",
             "setpoint_at_setup_V": f"{setpoint:.9g}",
@@ -438,9 +475,13 @@ class IsegEDCP:
         current, _ = yield from self._number(MEASURED_CURRENT, 10 * amperes)
         setpoint, _ = yield from self._number(SET_VOLTAGE, 2 * volts)
         status = yield from self._integer(CHANNEL_STATUS)
+        if status & ChannelStatus.EMERGENCY_OFF and not status & ChannelStatus.ON:
+            self._emergency_until_confirmed = False
         events = yield from self._integer(CHANNEL_EVENTS)
         module = yield from self._integer(MODULE_STATUS)
-        flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module))
+        flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module), self._bit_5)
+        if self._sign < 0:  # with which sign a negative channel states them is not settled: magnitudes
+            voltage, current, setpoint = abs(voltage), abs(current), abs(setpoint)
         self._samples.append(HVSample(t, voltage, current, setpoint, flags))
         if self._lost_settings:
             self._lost_settings = False
@@ -465,11 +506,29 @@ class IsegEDCP:
         for attempt in range(_ATTEMPTS):
             self.counters["writes_repeated"] += attempt > 0
             read_back = _value((yield from self._read(item, (frame,))))
-            if read_back == value or (isinstance(read_back, float) and math.isclose(read_back, value, rel_tol=1e-5)):
+            if read_back == value or (
+                isinstance(read_back, float) and math.isclose(abs(read_back), abs(value), rel_tol=1e-5)
+            ):
                 return
         raise DeviceRefused(
             self._label,
             f"{item.title} reads back as {read_back!r} after {value!r} was written",
+            "The module does not accept it: check its limits, its state, and who else commands it.",
+        )
+
+    def _write_control(self, word: ChannelControl) -> Script[None]:
+        """Set our own bits of the channel control to ``word`` and leave all others as they are found."""
+        self._control = yield from self._integer(CHANNEL_CONTROL)
+        for attempt in range(_ATTEMPTS):
+            self.counters["writes_repeated"] += attempt > 0
+            frame = write(self._module, CHANNEL_CONTROL, self._control & ~OWN_CONTROL | word, self._channel)
+            self._control = yield from self._integer(CHANNEL_CONTROL, (frame,))
+            if self._control & OWN_CONTROL == word:
+                return
+        raise DeviceRefused(
+            self._label,
+            f"channel control reads back as {self._control:04X} after {word:04X} was written to its bits "
+            f"{OWN_CONTROL:04X}",
             "The module does not accept it: check its limits, its state, and who else commands it.",
         )
 
@@ -499,7 +558,8 @@ class IsegEDCP:
         if status & ChannelStatus.ON:
             return
         # Written once only: a channel that trips at once must not be switched on again by a repetition.
-        frame = write(self._module, CHANNEL_CONTROL, int(ChannelControl.ON), self._channel)
+        foreign = (yield from self._integer(CHANNEL_CONTROL)) & ~OWN_CONTROL
+        frame = write(self._module, CHANNEL_CONTROL, foreign | ChannelControl.ON, self._channel)
         control = yield from self._integer(CHANNEL_CONTROL, (frame,), once=True)
         for _ in range(_SWITCH_ON_LOOKS):
             status = ChannelStatus((yield from self._integer(CHANNEL_STATUS)))
@@ -507,11 +567,12 @@ class IsegEDCP:
                 return
             control = yield from self._integer(CHANNEL_CONTROL, delay_s=_SWITCH_ON_WAIT_S)
         events = ChannelEvents((yield from self._integer(CHANNEL_EVENTS)))
+        module = yield from self._integer(MODULE_EVENTS)
         raise DeviceRefused(
             self._label,
-            f"did not switch on: control {control:04X}, status {_names(status) or 'off'}, "
-            f"events {_names(events & BLOCKING) or 'none'}",
-            "Check safety loop, inhibit input and limits, then try again.",
+            f"did not switch on: control {control:04X}, status {_names(status) or 'off'}, latched events "
+            f"{_names(events) or 'none'}, latched events of the module {module:04X}",
+            "A latched event blocks it until it is cleared. Check safety loop, inhibit input and limits; then clear.",
         )
 
     def _switch_off(self) -> Script[None]:
@@ -524,23 +585,30 @@ class IsegEDCP:
                 refused = error
         # An emergency off stays latched: only `clear` takes it back.
         latched = ChannelControl((yield from self._integer(CHANNEL_CONTROL))) & ChannelControl.EMERGENCY_OFF
-        yield from self._write_checked(CHANNEL_CONTROL, int(latched), self._channel)
+        yield from self._write_control(latched)
         if refused is not None:
             raise refused
 
     def _emergency_off(self) -> Script[None]:
+        """Wait for the confirmation of what `_repeat_emergency_off` sends: our own bits only."""
+        failure: DeviceError = DeviceRefused(self._label, "the channel's control does not take it")
         try:
-            yield from self._write_checked(CHANNEL_CONTROL, int(ChannelControl.EMERGENCY_OFF), self._channel)
+            for attempt in range(_EMERGENCY_LOOKS):
+                self._control = yield from self._integer(CHANNEL_CONTROL, delay_s=_EMERGENCY_AGAIN_S * (attempt > 0))
+                if self._control & ChannelControl.EMERGENCY_OFF:
+                    self._emergency_until_confirmed = False
+                    return
         except DeviceError as error:
-            self._link.write(EMERGENCY_OFF_ALL)
-            raise type(error)(
-                self._label,
-                f"EMERGENCY OFF IS NOT CONFIRMED ({error.what}); it was sent to all modules on the bus as well",
-                "Take the high voltage away by hand: safety loop or mains switch, then ground the electrodes.",
-            ) from error
+            failure = error
+        self._link.write(EMERGENCY_OFF_ALL)
+        raise type(failure)(
+            self._label,
+            f"EMERGENCY OFF IS NOT CONFIRMED ({failure.what}); it was sent to all modules on the bus as well",
+            "Take the high voltage away by hand: safety loop or mains switch, then ground the electrodes.",
+        )
 
     def _clear(self) -> Script[None]:
-        yield from self._write_checked(CHANNEL_CONTROL, 0, self._channel)
+        yield from self._write_control(ChannelControl(0))
         yield from self._acknowledge(MODULE_EVENTS, None)
         left = ChannelEvents((yield from self._acknowledge(CHANNEL_EVENTS, self._channel))) & BLOCKING
         if left:

@@ -58,7 +58,7 @@ class _Channel:
     on: bool = False
     emergency: bool = False
     event: int = 0
-    mask: int = 0
+    mask: int = BLOCKING  # an event blocks only if its bit is set here too
     trip_delay_ms: int = 0
     trip_action: int = DISABLED
     latched: int = 0  # status bits that stay until their event is cleared
@@ -86,6 +86,10 @@ class IsegTruth(OutputTruth, BusTruth):
     current_noise_nA: NotNegative = Field(default=5.0, description="Standard deviation of a current reading (nA).")
     voltage_limit_percent: Positive = Field(default=100.0, description="Hardware voltage limit (% of nominal).")
     current_limit_percent: Positive = Field(default=100.0, description="Hardware current limit (% of nominal).")
+    limit_good_bit: bool = Field(
+        default=False, description="Whether bit 5 of its status says that the hardware limit is good; most say nothing."
+    )
+    negative: bool = Field(default=False, description="Whether its channels give negative voltages.")
     logon_period_s: Positive = Field(default=5.0, description="How often it announces itself, not registered (s).")
 
 
@@ -109,6 +113,7 @@ class IsegEDCP:
         self._i_noise = ConversionNoise(rng.spawn(1)[0], ADC_S)
         self._base = 0x200 | settings.module << 3
         self.nominal_v = settings.nominal_voltage_V
+        self._sign = -1.0 if settings.negative else 1.0
         self.nominal_i = settings.nominal_current_mA * 1e-3
         self.stuck_on = False
         self.sag = 1.0
@@ -352,7 +357,7 @@ class IsegEDCP:
         return status
 
     def _module_status(self) -> int:
-        status = TEMPERATURE | SUPPLY | MODULE_GOOD | LIMIT_GOOD
+        status = TEMPERATURE | SUPPLY | MODULE_GOOD | (LIMIT_GOOD if self._settings.limit_good_bit else 0)
         events = self._event & self._event_mask or any(c.event & c.mask for c in self._channels)
         for bit, true in (
             (KILL, self._kill),
@@ -478,11 +483,11 @@ class IsegEDCP:
             case 0x4006:
                 return bytes([channel.trip_action])
             case 0x4100:
-                return struct.pack(">f", channel.setpoint)
+                return struct.pack(">f", self._sign * channel.setpoint)
             case 0x4101:
                 return struct.pack(">f", channel.current_limit)
             case 0x4102:
-                return struct.pack(">f", self._measured_v(t) if first else 0.0)
+                return struct.pack(">f", self._sign * self._measured_v(t) if first else 0.0)
             case 0x4103:
                 return struct.pack(">f", self._measured_i(t) if first else 0.0)
             case 0x4104:
@@ -490,7 +495,7 @@ class IsegEDCP:
             case 0x4105:
                 return struct.pack(">f", channel.i_bounds)
             case 0x4106:
-                return struct.pack(">f", self.nominal_v)
+                return struct.pack(">f", self._sign * self.nominal_v)
             case 0x4107:
                 return struct.pack(">f", self.nominal_i)
             case 0x4123 | 0x4124:
@@ -575,6 +580,8 @@ class IsegEDCP:
             return True
         if opcode in (0x4100, 0x4101, 0x4104, 0x4105) and len(value) == 4:
             (number,) = struct.unpack(">f", value)
+            if opcode == 0x4100:  # either sign means the channel's own
+                number = abs(number)
             return self._write_quantity(opcode, channel, number, t)
         return False
 
@@ -601,14 +608,19 @@ class IsegEDCP:
     def _set_control(self, channel: _Channel, word: int, t: float) -> None:
         was_emergency = channel.emergency
         channel.emergency = bool(word & EMERGENCY)
-        channel.control = word & (EMERGENCY | ON)
+        channel.control = word  # bits that mean nothing here are kept as they were written
         if channel.emergency:
             self._off_at_once(channel, t)
             channel.event |= EMERGENCY
             channel.control &= ~ON
             return
         if word & ON:
-            blocked = channel.event & BLOCKING or self._event & SAFETY_LOOP or self._interlock_open or self._inhibited
+            blocked = (
+                channel.event & BLOCKING & channel.mask
+                or self._event & SAFETY_LOOP
+                or self._interlock_open
+                or self._inhibited
+            )
             if blocked or was_emergency:
                 channel.control &= ~ON
             elif not channel.on:

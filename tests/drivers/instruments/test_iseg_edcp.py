@@ -24,7 +24,6 @@ GOOD = int(
     | ModuleStatus.SAFETY_LOOP_GOOD
     | ModuleStatus.NO_RAMP
     | ModuleStatus.NO_SUM_ERROR
-    | ModuleStatus.HARDWARE_VOLTAGE_LIMIT_GOOD
 )
 
 
@@ -494,10 +493,85 @@ def test_emergency_off_is_sent_to_a_module_that_never_answers() -> None:
     rig.hv.emergency_off()
     rig.run(0.002)
     assert rig.module.sent[-2:] == [frame("200# 40 01 00 00 20"), frame("201# 40 01 00")]
+    rig.run(0.1)
+    assert 8 <= rig.writes.count(frame("200# 40 01 00 00 20")) <= 12  # every 10 ms
     with pytest.raises(DeviceSilent, match="EMERGENCY OFF IS NOT CONFIRMED"):
         rig.run(2.0)
-    assert rig.writes.count(frame("200# 40 01 00 00 20")) == 3
-    assert rig.writes.index(edcp.EMERGENCY_OFF_ALL) > 3  # the last resort
+    assert rig.writes.index(edcp.EMERGENCY_OFF_ALL) > 30  # the last resort
+
+
+FOREIGN = 0x0402
+
+
+def test_bits_of_the_control_register_that_are_somebody_elses_stay_and_confuse_nobody() -> None:
+    rig = Rig().until_ready()
+    rig.module.set(edcp.CHANNEL_CONTROL, FOREIGN)
+    rig.hv.set_voltage(1000.0)
+    rig.hv.switch_on()
+    rig.settle()
+    assert rig.module.get(edcp.CHANNEL_CONTROL) == FOREIGN | 0x08
+    rig.hv.switch_off()
+    rig.settle()
+    assert rig.module.get(edcp.CHANNEL_CONTROL) == FOREIGN
+    rig.hv.emergency_off()
+    rig.settle()
+    assert rig.module.get(edcp.CHANNEL_CONTROL) == FOREIGN | 0x20
+    assert edcp.EMERGENCY_OFF_ALL not in rig.writes
+    rig.hv.clear()
+    rig.settle()
+    assert rig.module.get(edcp.CHANNEL_CONTROL) == FOREIGN
+
+
+def test_an_emergency_off_goes_out_before_anything_is_read() -> None:
+    rig = Rig().until_ready()
+    order: list[str] = []
+    read, write = rig.module.read, rig.module.write
+    rig.module.read = lambda: order.append("read") or read()  # type: ignore[method-assign, func-returns-value]
+    rig.module.write = lambda f: order.append(f.data.hex()) or write(f)  # type: ignore[method-assign, func-returns-value]
+    rig.hv.emergency_off()
+    rig.run(0.001)
+    assert order[0] == "4001000020"
+
+
+@pytest.mark.parametrize(
+    ("bit_5", "module", "bad"),
+    [
+        ("unused", GOOD, False),
+        ("unused", GOOD | 1 << 5, False),
+        ("limit good", GOOD | 1 << 5, False),
+        ("limit good", GOOD, True),
+        ("input error", GOOD, False),
+        ("input error", GOOD | 1 << 5, True),
+    ],
+)
+def test_bit_5_of_the_module_status_means_what_the_class_of_the_module_says(bit_5: str, module: int, bad: bool) -> None:
+    flags = edcp.hv_flags(ChannelStatus(0), ChannelEvents(0), ModuleStatus(module), bit_5)
+    assert (HVFlag.FAULT in flags) is bad
+
+
+@pytest.mark.parametrize("stated", [1.0, -1.0])
+def test_a_negative_channel_is_used_by_magnitudes(stated: float) -> None:
+    """With which sign it states set-point and measurement is not settled: either is taken."""
+    module = Module()
+    module.set(edcp.NOMINAL_VOLTAGE, -6000.0)
+    module.set(edcp.MEASURED_VOLTAGE, stated * 1000.0)
+    rig = Rig(module).until_ready()
+    assert rig.hv.nominal[0] == 6000.0 and rig.hv.settings["polarity"] == "negative"
+    rig.hv.set_voltage(1500.0)
+    rig.settle()
+    assert rig.module.get(edcp.SET_VOLTAGE) == -1500.0
+    rig.run(0.3)
+    assert rig.samples[-1].voltage == 1000.0 and rig.samples[-1].setpoint == 1500.0
+
+
+def test_a_latched_event_that_keeps_the_channel_off_is_named() -> None:
+    rig = Rig().until_ready()
+    rig.module.set(edcp.CHANNEL_EVENTS, int(ChannelEvents.VOLTAGE_BOUNDS))
+    rig.module.set(edcp.MODULE_EVENTS, 0x0400)
+    rig.module.control = lambda channel, bits: None  # type: ignore[method-assign]  # it is refused
+    rig.hv.switch_on()
+    with pytest.raises(DeviceRefused, match=r"VOLTAGE_BOUNDS, latched events of the module 0400"):
+        rig.settle()
 
 
 def test_emergency_off_that_does_not_take_is_said_loudly() -> None:

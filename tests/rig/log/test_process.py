@@ -7,9 +7,11 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
+from rig.base.clock import RealClock
 from rig.log import frames
 from rig.log.errors import LogError
 from rig.log.process import LogProcess
@@ -131,13 +133,55 @@ def test_a_writer_that_hangs_blocks_nobody(tmp_path):
         os.kill(log.pid, signal.SIGSTOP)
         try:
             record(log, 100, start=50)  # the first turns: what was said before may still come in
-            log.tick(0.15)
-            log.tick(0.15 + SILENCE_S)
+            for k in range(round(SILENCE_S / 0.02) + 5):  # twenty milliseconds a turn, as a loop does
+                log.tick(0.15 + 0.02 * k)
         finally:
             os.kill(log.pid, signal.SIGCONT)
     # it went on, and saved what had been sent
     until(lambda: read_log(log.part).ended)
     assert read_log(log.part).topics == {"/force/sample": 150}
+
+
+def test_a_writer_that_was_stopped_for_good_is_ended(tmp_path):
+    with pytest.raises(LogError, match=r"not answered for 0\.8 s"), LogProcess(tmp_path / "a.mcap") as log:
+        record(log)
+        os.kill(log.pid, signal.SIGSTOP)
+        for k in range(60):
+            log.tick(0.15 + 0.02 * k)
+    assert log._process.returncode == -signal.SIGKILL  # no orphan
+
+
+def test_a_loop_of_ours_that_was_held_up_is_not_the_writers_silence(tmp_path):
+    with LogProcess(tmp_path / "a.mcap") as log:
+        record(log)
+        log.tick(0.1)
+        log.tick(10.0)
+        log.finish({})
+
+
+@pytest.mark.parametrize("how", ["deleted", "replaced", "moved away with its folder"])
+def test_a_log_that_is_deleted_while_it_is_written_is_noticed_and_saved(tmp_path, monkeypatch, how):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
+    with pytest.raises(LogError, match="while it was written") as caught, LogProcess(folder / "a.mcap") as log:
+        record(log)
+        until(lambda: read_log(log.part).topics)
+        log.part.unlink()
+        if how == "replaced":
+            log.part.write_bytes(b"another")
+        elif how != "deleted":
+            folder.rmdir()
+        began = RealClock()
+        while True:
+            assert began.now() < 5.0
+            log.tick(began.now())
+            time.sleep(0.01)
+    assert began.now() < 2.0
+    saved = Path(str(caught.value).split("saved in ")[1].rstrip("."))
+    assert read_log(saved).topics["/force/sample"] > 0
+    assert saved.parent == (folder if how in ("deleted", "replaced") else tmp_path / "tmp")
 
 
 def test_what_waits_for_a_hanging_writer_is_bounded(tmp_path):

@@ -18,6 +18,7 @@ import pytest
 
 from rig.benchmark.stand import Stand
 from rig.log.reader import read_log
+from rig.protocol.experiment import SERVED_BY, SERVER
 from rig.sim.settings import Fault
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs the dependency group browser")
@@ -61,7 +62,7 @@ class Live:
         self.stand, self.log = stand, folder / "run.mcap"
         stand.bench.power_cycle()
         ports = folder / "ports.json"
-        ports.write_text(json.dumps(dict(stand.bench.ports)))
+        ports.write_text(json.dumps({**stand.bench.ports, SERVED_BY: SERVER}))
         options = ["--arm", "--yes"] if protocol == stand.protocol else []
         self.run = process(folder / "run.txt", "run", stand.scene, protocol, "-o", self.log, "--ports", ports, *options)
         self.wait(lambda: self.log.with_name("run.mcap.part").exists(), "a log")

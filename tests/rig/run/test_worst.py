@@ -104,5 +104,5 @@ def test_whether_the_voltage_may_ramp_down_goes_by_the_role_and_not_by_a_name(
 
 
 def test_the_outcome_says_not_safe_of_itself() -> None:
-    ended = Outcome("not safe", "stopped by a test", False, True, math.nan, 0.0, 0.0, 1.0)
-    assert "NOT SAFE" in ended.state and ended.as_text()["status"] == "not safe"
+    ended = Outcome("NOT SAFE", "stopped by a test", False, True, math.nan, 0.0, 0.0, 1.0)
+    assert "NOT SAFE" in ended.state and ended.as_text()["status"] == "NOT SAFE"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -64,9 +65,10 @@ def sample(voltage: float, flags: HVFlag = OFF, current: float = 0.0, setpoint: 
 
 
 def live() -> tuple[Guard, Supply, list[str]]:
+    """Sent to 1000 V long ago."""
     guard, supply, log = make()
-    guard.on_sample(sample(0.0))
-    guard.on_sample(sample(0.0))
+    for _ in range(2):
+        guard.on_sample(replace(sample(0.0), t=-100.0))
     guard.arm()
     guard.request(1000.0, 0.0)
     return guard, supply, log
@@ -289,7 +291,66 @@ def test_a_monitor_that_does_not_move_with_the_ramp_is_frozen(orderly: bool) -> 
             guard.on_sample(at(0.1 * number, 1000.0, ramping, 1e-8 * number))
 
 
-def test_a_ramp_that_moves_however_slowly_is_none_that_is_frozen() -> None:
+def test_a_ramp_that_moves_however_slowly_is_none_that_is_frozen_but_one_that_lags() -> None:
     guard, _, _ = live()
-    for number in range(100):
-        guard.on_sample(at(0.1 * number, 500.0 + number // 2, HVFlag.ON | HVFlag.RAMPING))
+    with pytest.raises(FaultError, match="sagged to 5"):
+        for number in range(100):
+            guard.on_sample(at(0.1 * number, 500.0 + number // 2, HVFlag.ON | HVFlag.RAMPING))
+
+
+# The measured voltage against the commanded ramp -----------------------------------------------------------------
+
+RAMPING = HVFlag.ON | HVFlag.RAMPING
+
+
+def settled_guard() -> Guard:
+    """At 1000 V, since long."""
+    guard, supply, _ = live()
+    supply.measures_current = False  # what the film takes is not what is tried here
+    for t in (-50.0, -0.2, -0.1, 0.0, 0.1, 0.2):
+        guard.on_sample(at(t, 999.5 + 0.1 * t))
+    return guard
+
+
+@pytest.mark.parametrize("flags", [HVFlag.ON, RAMPING])
+@pytest.mark.parametrize("rate", [5.0, 20.0, 100.0, -20.0])
+def test_an_output_that_creeps_is_a_fault_whatever_the_supply_says_of_itself(rate: float, flags: HVFlag) -> None:
+    guard = settled_guard()
+    with pytest.raises(FaultError, match="risen to 10[5-9]" if rate > 0 else "sagged to 9[2-5]"):
+        for number in range(3, 500):
+            voltage = 1000.0 + rate * 0.1 * (number - 3)
+            assert abs(voltage - 1000.0) < 90.0
+            guard.on_sample(at(0.1 * number, voltage, flags))
+
+
+def test_an_output_that_jumps_past_its_ramp_is_a_fault_though_it_is_below_its_set_point() -> None:
+    guard = settled_guard()
+    guard.request(1400.0, 0.0)
+    guard.on_sample(at(0.3, 1030.0, RAMPING, setpoint=1400.0))
+    guard.on_sample(at(0.4, 1300.0, RAMPING, setpoint=1400.0))
+    with pytest.raises(FaultError, match="run ahead of its ramp to 1330 V with 1400 V set"):
+        guard.on_sample(at(0.5, 1330.0, RAMPING, setpoint=1400.0))
+
+
+def test_an_output_that_says_ramping_and_stays_is_a_fault_in_about_the_ramps_own_time() -> None:
+    guard = settled_guard()
+    guard.request(1300.0, 0.0)  # 1 s
+    end = 0.0
+    with pytest.raises(FaultError, match="sagged to 10"):
+        for number in range(3, 100):
+            end = 0.1 * number
+            guard.on_sample(at(end, 1000.0 + number % 7, RAMPING, setpoint=1300.0))
+    assert 1.0 < end < 2.0
+
+
+@pytest.mark.parametrize("start", [1000.0, 400.0])
+def test_a_ramp_down_that_does_not_come_down_is_not_waited_for(start: float) -> None:
+    guard, _, _ = live()
+    guard.on_sample(at(0.0, start, RAMPING))
+    guard.ramp_off("end")
+    end = 0.0
+    with pytest.raises(FaultError, match="its ramp down has it below"):
+        for number in range(1, 200):
+            end = 0.1 * number
+            guard.on_sample(at(end, start - number % 5, RAMPING, setpoint=0.0))
+    assert end < 3.0  # one that was on its way up may go on until the command has arrived

@@ -242,7 +242,7 @@ def test_a_port_that_does_not_exist(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text(text)
     out = tmp_path / "x.mcap"
-    result = CliRunner().invoke(main, ["run", str(scene), str(PROTOCOL), "-o", str(out), "--arm", "--yes"])
+    result = CliRunner().invoke(main, ["run", str(scene), str(PROTOCOL), "-o", str(out), "--arm"])
     assert result.exit_code == 4, result.output
     assert "no-can" in result.output and "hv" in result.output  # the supply's guard opens its link first
     assert "Traceback" not in result.output
