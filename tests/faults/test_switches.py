@@ -200,11 +200,12 @@ def test_the_run_ends_as_required(tell: Tell, driver: str, kind: str) -> None:
         counters = counted(story, role)
         assert any(counters.get(key, 0) for key in SEEN_DAMAGE[driver]) or story.took < 1.0, counters
     else:
-        assert story.outcome.status in ("fault", "limit"), story.outcome
+        assert story.outcome.status in (("not safe",) if end == NOT_SAFE else ("fault", "limit")), story.outcome
     assert story.outcome.safe is (end != NOT_SAFE), story.outcome
     assert read_log(story.log).outcome["status"] == story.outcome.status  # type: ignore[index]
     # What really became of the output: only one that does not obey, or hears nothing, is still there.
-    assert (abs(story.final_output) < 60) is (kind != "stuck_on" and (role, kind) != ("hv", "vanish"))
+    unheard = (role, kind) == ("hv", "vanish") and driver != "labjack-amplifier"  # whose own watchdog has acted
+    assert (abs(story.final_output) < 60) is (kind != "stuck_on" and not unheard)
     if end == NOT_SAFE:
         events = [message.fields["message"] for message in read_log(story.log).messages("/event")]
         assert any(text.startswith("NOT SAFE") for text in events)

@@ -52,6 +52,7 @@ class Running:
         scene = folder / "scene.toml"
         scene.write_text(text)
         short = (FIXTURES / "protocols" / "short.toml").read_text()
+        short = short.replace("duration_s = 0.5", "duration_s = 3.0")  # enough samples on a busy machine, too
         (folder / "protocol.toml").write_text(short.replace("[0, 800]", "[800]"))
         self.bench = ServedBench(simulated_bench(load_scene(scene)[0]))
         self.bench.__enter__()
@@ -142,12 +143,20 @@ def test_the_output_goes_off_without_any_of_our_processes(running: Running, sent
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 def test_fifty_times(tmp_path: Path, sent: int) -> None:
-    times = []
-    for n in range(50):
+    times: list[float] = []
+    for n in range(75):
         (tmp_path / str(n)).mkdir()
         run = Running(tmp_path / str(n))
+        try:
+            run.until_live()
+        except AssertionError:  # a machine so busy that the run ended before there was voltage: it counts for nothing
+            run.close()
+            continue
         try:
             times.append(off_within(run, sent))
         finally:
             run.close()
-    assert max(times) < WATCHDOG_S + MARGIN_S
+        if len(times) == 50:
+            break
+    print(f"{len(times)} times, off after {min(times):.2f} to {max(times):.2f} s")
+    assert len(times) == 50 and max(times) < WATCHDOG_S + MARGIN_S

@@ -396,6 +396,8 @@ class LabJackAmplifier:
             return
         if self._target > self._setpoint:
             self._check_dac(self._dac_volts)
+        elif self._volts(self._dac_volts) < self._setpoint - self._least_step:
+            self._setpoint = self._volts(self._dac_volts)  # somebody was faster: the way down goes on from there
         if self._is_behind(self._measured):
             return
         elapsed = min(self._now - self._stepped_at, LONGEST_STEP_S)
@@ -417,7 +419,8 @@ class LabJackAmplifier:
     def _is_behind(self, voltage: float) -> bool:
         """Whether the output lags behind the set-point: the ramp waits, for a while."""
         allowed = max(LAG_V, (LAG_PART + self._tolerance) * self._setpoint)
-        behind = abs(self._setpoint - voltage) > allowed
+        missing = self._setpoint - voltage if self._target > self._setpoint else voltage - self._setpoint
+        behind = missing > allowed
         if not behind:
             self._lags_since = None
             return False
@@ -542,6 +545,7 @@ class LabJackAmplifier:
     def _switch_off(self) -> Script:
         self._wanted, self._stepped_at, self._lags_since = 0.0, self._now, None
         while self._on and self._setpoint > 0:
+            self._renewed = True  # the way to 0 V has been decided, and is let come to its end
             yield from self._cycle()
             yield from self._sample(delay_s=self._period)
         yield from self._cut()

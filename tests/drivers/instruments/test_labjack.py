@@ -266,6 +266,28 @@ def test_after_the_watchdog_has_acted_the_output_is_not_raised() -> None:
     assert rig.output == 0.0
 
 
+def test_a_ramp_down_that_was_decided_comes_to_its_end() -> None:
+    """Longer than the watchdog's time, with nobody renewing."""
+    rig = Rig()
+    rig.up(1000.0)
+    rig.supply.set_ramp(200.0)
+    rig.guarded = False
+    rig.supply.switch_off()
+    rig.run(4.5)
+    assert 50.0 < rig.output < 150.0 and rig.box.watchdog_acted == 0
+    rig.run(1.5)
+    assert rig.output == 0.0 and rig.box.dac[0] == 0.0 and not rig.supply.busy
+
+
+def test_a_ramp_down_goes_on_from_where_the_output_is() -> None:
+    rig = Rig()
+    rig.up(1000.0)
+    rig.box.write(1000, f32(0.3), rig.clock.now())  # somebody else has taken it down
+    rig.supply.switch_off()
+    rig.run(1.0)
+    assert rig.output == 0.0 and not rig.supply.busy
+
+
 def test_emergency_off_is_at_once_and_latches() -> None:
     rig = Rig()
     rig.up(1000.0)
