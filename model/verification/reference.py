@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.specimen import Specimen
+from model.verification.taylor_series import States, derivative, evaluate, stresses, taut_series, wrinkled_series
 
 Array = NDArray[np.float64]
 
@@ -59,36 +60,6 @@ class Reference:
     wrinkled: NDArray[np.bool_]  # some part of the film carries no hoop stress
     converged: NDArray[np.bool_]
     closure: Array
-
-
-@dataclass
-class _States:
-    """B states, lengths over the ring radius and stresses over ``scale``."""
-
-    mu: Array  # (N, B)
-    alpha: Array  # (N, B)
-    scale: Array
-    electric: Array  # eps (V/T)^2 / scale
-    log_prestretch: Array
-    log_disk: Array  # ln(a/b)
-    height: Array
-    relaxed: bool
-
-    def take(self, index: NDArray[np.intp]) -> _States:
-        return _States(
-            self.mu[:, index],
-            self.alpha[:, index],
-            self.scale[index],
-            self.electric[index],
-            self.log_prestretch[index],
-            self.log_disk[index],
-            self.height[index],
-            self.relaxed,
-        )
-
-    @property
-    def size(self) -> int:
-        return self.height.size
 
 
 def reference(
@@ -129,7 +100,7 @@ def _solve_block(films: list[Specimen], h: Array, voltage: Array, relaxed: bool)
     thickness = np.array([film.thickness for film in films])
     prestretch = np.array([film.prestretch for film in films])
     permittivity = np.array([film.material.permittivity for film in films])
-    states = _States(
+    states = States(
         mu / scale,
         alpha,
         scale,
@@ -162,7 +133,7 @@ def _solve_block(films: list[Specimen], h: Array, voltage: Array, relaxed: bool)
 # ---- from the natural state to the wanted one
 
 
-def _continue(target: _States) -> tuple[Array, NDArray[np.bool_]]:
+def _continue(target: States) -> tuple[Array, NDArray[np.bool_]]:
     """Unknowns ``ln e1``, ``ln theta`` at the disk, shape (2, B), and whether they solve the equations."""
     count = target.size
     slope = target.height / (1.0 - np.exp(target.log_disk))
@@ -170,7 +141,7 @@ def _continue(target: _States) -> tuple[Array, NDArray[np.bool_]]:
     spread = -np.exp(target.log_disk) * target.log_disk  # (a/b) ln(b/a): height over slope at the disk, small heights
     start = np.minimum(0.05 * np.sqrt(helped) * spread, 0.5 * target.height)
 
-    def at(index: NDArray[np.intp], progress: Array) -> _States:
+    def at(index: NDArray[np.intp], progress: Array) -> States:
         """Leg 0: height, leg 1: pre-stretch, leg 2: voltage."""
         states = target.take(index)
         leg = [np.clip(progress - k, 0.0, 1.0) for k in range(3)]
@@ -227,7 +198,7 @@ def _continue(target: _States) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _newton(
-    states: _States, guess: Array, order: int, series_tolerance: float, tolerance: float, limit: int
+    states: States, guess: Array, order: int, series_tolerance: float, tolerance: float, limit: int
 ) -> tuple[Array, NDArray[np.bool_], Array]:
     """Newton's method on the two conditions at the ring; steps of ``tolerance`` or less end it.
 
@@ -287,7 +258,7 @@ class _Path:
 
 
 def _integrate(
-    states: _States,
+    states: States,
     unknowns: Array,
     order: int,
     tolerance: float,
@@ -310,11 +281,11 @@ def _integrate(
     x = states.log_disk.copy()
     wrinkled = np.zeros(count, bool)
     if states.relaxed:
-        _, s2 = _stresses(states, e1, e2)
+        _, s2 = stresses(states, e1, e2)
         wrinkled = s2 < 0
-        natural = np.where(wrinkled, _natural_hoop(states, e1, e2), e2)
+        natural = np.where(wrinkled, natural_hoop(states, e1, e2), e2)
     ever = wrinkled.copy()
-    s1, s2 = _stresses(states, e1, natural)
+    s1, s2 = stresses(states, e1, natural)
     pull_at_disk = np.exp(x) * s1 * np.exp(-e1) * np.sin(theta)
     peak, low1, low2 = e1 + natural, s1.copy(), np.where(wrinkled, 0.0, s2)
     widest = np.maximum(e1, e2)
@@ -327,7 +298,7 @@ def _integrate(
         for pleated in (False, True):
             who = np.flatnonzero(zone == pleated)
             if who.size:
-                build = _wrinkled_series if pleated else _taut_series
+                build = wrinkled_series if pleated else taut_series
                 series[:, :, who] = build(part.take(who), x[running][who], position[:, who], order)
         scale = np.stack(
             [strain_scale, strain_scale, strain_scale, angle_scale, np.maximum(drop, states.height)], axis=0
@@ -348,26 +319,26 @@ def _integrate(
             last &= ~changed
         if extremes:
             for piece in 0.5 - 0.5 * np.cos(np.pi * np.arange(1, SAMPLES + 1) / SAMPLES):
-                value = _evaluate(series, piece * length)
-                t1, t2 = _stresses(part, value[0], value[2])
+                value = evaluate(series, piece * length)
+                t1, t2 = stresses(part, value[0], value[2])
                 peak[running] = np.fmax(peak[running], value[0] + value[2])
                 low1[running] = np.fmin(low1[running], t1)
                 low2[running] = np.fmin(low2[running], np.where(zone, 0.0, t2))
                 widest[running] = np.fmax(widest[running], np.fmax(value[0], value[1]))
             _refine_extremes(part, series, zone, length, running, peak, low1, low2)
-        e1[running], e2[running], natural[running], theta[running], drop[running] = _evaluate(series, length)
+        e1[running], e2[running], natural[running], theta[running], drop[running] = evaluate(series, length)
         x[running] = np.where(last, 0.0, x[running] + length)
         if states.relaxed:
             wrinkled[running] = zone ^ changed
             ever |= wrinkled
             natural[running] = np.where(wrinkled[running], natural[running], e2[running])
-        tension, _ = _stresses(part, e1[running], natural[running])
+        tension, _ = stresses(part, e1[running], natural[running])
         alive = (tension > 0) & np.isfinite(theta[running]) & (length > 0)
         running = running[alive & ~last]
         if running.size == 0:
             break
     unfinished = x != 0.0
-    s1, _ = _stresses(states, e1, natural)
+    s1, _ = stresses(states, e1, natural)
     pull_at_ring = s1 * np.exp(-e1) * np.sin(theta)
     hoop_miss = (e2 - states.log_prestretch) / strain_scale
     height_miss = (drop - states.height) / states.height
@@ -375,27 +346,17 @@ def _integrate(
     return _Path(hoop_miss, height_miss, pull_at_disk, pull_at_ring, np.exp(peak), low1, low2, np.exp(widest), ever)
 
 
-def _stresses(states: _States, e1: Array, e2: Array) -> tuple[Array, Array]:
-    """True stresses over ``scale``; differences of powers by expm1."""
-    along, across = np.expm1(states.alpha * e1), np.expm1(states.alpha * e2)
-    through = np.expm1(-states.alpha * (e1 + e2))
-    maxwell = states.electric * np.exp(2 * (e1 + e2))
-    s1 = np.sum(states.mu * (along - through), axis=0) - maxwell
-    s2 = np.sum(states.mu * (across - through), axis=0) - maxwell
-    return s1, s2
-
-
-def _natural_hoop(states: _States, e1: Array, start: Array) -> Array:
+def natural_hoop(states: States, e1: Array, start: Array) -> Array:
     """First hoop strain above ``start`` without hoop stress, where the stress at ``start`` is negative; NaN if none."""
     low, high = start.copy(), start + 0.02
     for _ in range(60):
-        short = _stresses(states, e1, high)[1] < 0
+        short = stresses(states, e1, high)[1] < 0
         if not short.any():
             break
         low, high = np.where(short, high, low), np.where(short, high + 0.1, high)
     natural = high.copy()
     for _ in range(80):  # Newton's method, kept inside the bracket
-        _, s2 = _stresses(states, e1, natural)
+        _, s2 = stresses(states, e1, natural)
         low, high = np.where(s2 < 0, natural, low), np.where(s2 < 0, high, natural)
         change = -s2 / _stiffness(states, e1, natural)[2]
         inside = (natural + change > low) & (natural + change < high)
@@ -406,33 +367,21 @@ def _natural_hoop(states: _States, e1: Array, start: Array) -> Array:
     return np.where(short, np.nan, natural)
 
 
-def _evaluate(series: Array, length: Array) -> Array:
-    value: Array = series[-1]
-    for k in range(series.shape[0] - 2, -1, -1):
-        value = value * length + series[k]
-    return value
-
-
-def _derivative(series: Array) -> Array:
-    out: Array = series[1:] * np.arange(1, series.shape[0])[:, None, None]
-    return out
-
-
-def _margin(states: _States, value: Array, zone: NDArray[np.bool_]) -> Array:
+def _margin(states: States, value: Array, zone: NDArray[np.bool_]) -> Array:
     """Positive as long as a state belongs to its zone: hoop stress where taut, width to spare where wrinkled."""
-    _, s2 = _stresses(states, value[0], value[2])
+    _, s2 = stresses(states, value[0], value[2])
     return np.where(zone, value[2] - value[1], s2)
 
 
 def _first_change(
-    states: _States, series: Array, zone: NDArray[np.bool_], length: Array
+    states: States, series: Array, zone: NDArray[np.bool_], length: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Cut the steps at the first point where the zone changes."""
     low, high = np.zeros_like(length), length.copy()
     changed = np.zeros(length.size, bool)
     for k in range(1, SAMPLES + 1):
         at = length * (k / SAMPLES)
-        outside = ~changed & (_margin(states, _evaluate(series, at), zone) < 0)
+        outside = ~changed & (_margin(states, evaluate(series, at), zone) < 0)
         # A step that starts on an edge begins with a margin of zero: round-off there is no change of zone.
         outside &= at > 1e-12
         high[outside] = at[outside]
@@ -443,14 +392,14 @@ def _first_change(
         return length, changed
     part, piece, pleated = states.take(who), series[:, :, who], zone[who]
     lo, hi = low[who], high[who]
-    f_lo = _margin(part, _evaluate(piece, lo), pleated)
-    f_hi = _margin(part, _evaluate(piece, hi), pleated)
+    f_lo = _margin(part, evaluate(piece, lo), pleated)
+    f_hi = _margin(part, evaluate(piece, hi), pleated)
     f_lo = np.maximum(f_lo, 0.0)
     for k in range(80):  # regula falsi, with a bisection every third time
         width = f_lo - f_hi
         share = np.where((width > 0) & (k % 3 != 2), f_lo / np.where(width > 0, width, 1.0), 0.5)
         mid = lo + share * (hi - lo)
-        f_mid = _margin(part, _evaluate(piece, mid), pleated)
+        f_mid = _margin(part, evaluate(piece, mid), pleated)
         right = f_mid <= 0
         hi, f_hi = np.where(right, mid, hi), np.where(right, f_mid, f_hi)
         lo, f_lo = np.where(right, lo, mid), np.where(right, f_lo, f_mid)
@@ -462,7 +411,7 @@ def _first_change(
 
 
 def _refine_extremes(
-    states: _States,
+    states: States,
     series: Array,
     zone: NDArray[np.bool_],
     length: Array,
@@ -472,10 +421,10 @@ def _refine_extremes(
     low2: Array,
 ) -> None:
     """Interior extremes, by bisection of the slope along the series wherever it changes sign between samples."""
-    slopes = _derivative(series)
+    slopes = derivative(series)
 
     def rates(at: Array) -> tuple[Array, Array, Array]:
-        value, slope = _evaluate(series, at), _evaluate(slopes, at)
+        value, slope = evaluate(series, at), evaluate(slopes, at)
         s11, s12, s22 = _stiffness(states, value[0], value[2])
         return (
             slope[0] + slope[2],
@@ -496,14 +445,14 @@ def _refine_extremes(
                 mid = 0.5 * (lo + hi)
                 rising = sign * rates(mid)[quantity] > 0
                 hi, lo = np.where(rising, mid, hi), np.where(rising, lo, mid)
-            value = _evaluate(series, hi)
-            s1, s2 = _stresses(states, value[0], value[2])
+            value = evaluate(series, hi)
+            s1, s2 = stresses(states, value[0], value[2])
             found = (value[0] + value[2], s1, s2)[quantity]
             pick = np.fmax if quantity == 0 else np.fmin
             best[running[turn]] = pick(best[running[turn]], found[turn])
 
 
-def _stiffness(states: _States, e1: Array, e2: Array) -> tuple[Array, Array, Array]:
+def _stiffness(states: States, e1: Array, e2: Array) -> tuple[Array, Array, Array]:
     """``ds_i/de_j`` over ``scale``."""
     weight = states.mu * states.alpha
     through = np.sum(weight * np.exp(-states.alpha * (e1 + e2)), axis=0)
@@ -511,129 +460,3 @@ def _stiffness(states: _States, e1: Array, e2: Array) -> tuple[Array, Array, Arr
     s11 = np.sum(weight * np.exp(states.alpha * e1), axis=0) + s12
     s22 = np.sum(weight * np.exp(states.alpha * e2), axis=0) + s12
     return s11, s12, s22
-
-
-# ---- the series
-
-
-def _dot(left: Array, right: Array, k: int) -> Array:
-    """Coefficient ``k`` of a product."""
-    out: Array = np.einsum("ib,ib->b", left[: k + 1], right[k::-1])
-    return out
-
-
-def _divide(numerator: Array, quotient: Array, denominator: Array, k: int) -> None:
-    """Set coefficient ``k`` of a quotient from that of its numerator."""
-    if k:
-        numerator = numerator - np.einsum("ib,ib->b", quotient[:k], denominator[k:0:-1])
-    quotient[k] = numerator / denominator[0]
-
-
-class _Film:
-    """Series of the stresses, the stiffnesses and of ``exp(e1 - hoop)``, ``R l1 / (b lp)``, for series of the strains.
-
-    Everything is a sum of exponentials of ``c1 e1 + c2 e2 + c3 x``, one row each, extended together:
-    ``y = exp(u)`` gives ``k y_k = sum_i i u_i y_(k-i)``. ``e2`` is the strain that sets the stress.
-    """
-
-    def __init__(self, states: _States, order: int, x: Array, e1: Array, e2: Array) -> None:
-        alpha, mu = states.alpha, states.mu
-        n, none = len(mu), np.zeros_like(alpha)
-        # Rows: l1^alpha, l2^alpha, (l1 l2)^-alpha, (l1 l2)^2, R l1 / (b lp).
-        one = np.ones((1, states.size))
-        self.by_e1 = np.concatenate([alpha, none, -alpha, 2 * one, one])
-        self.by_e2 = np.concatenate([none, alpha, -alpha, 2 * one, 0 * one])
-        argument = self.by_e1 * e1 + self.by_e2 * e2
-        argument[-1] += x - states.log_prestretch
-        self.rows = np.empty((order + 1, *argument.shape))
-        self.rows[0] = np.exp(argument)
-        self.rates = np.empty_like(self.rows)
-        weight, zero = mu * alpha, 0 * one
-        maxwell = states.electric[None]
-        self.mix = np.stack(  # s1, s2, s2 - s1, s11, s12, s22
-            [
-                np.concatenate([mu, none, -mu, -maxwell, zero]),
-                np.concatenate([none, mu, -mu, -maxwell, zero]),
-                np.concatenate([-mu, mu, none, zero, zero]),
-                np.concatenate([weight, none, weight, -2 * maxwell, zero]),
-                np.concatenate([none, none, weight, -2 * maxwell, zero]),
-                np.concatenate([none, weight, weight, -2 * maxwell, zero]),
-            ]
-        )
-        self.out = np.empty((order + 1, 6, states.size))
-        self.out[0] = np.einsum("qrb,rb->qb", self.mix, self.rows[0])
-        # Differences of nearly equal powers must not be formed from the powers.
-        self.out[0, 0], self.out[0, 1] = _stresses(states, e1, e2)
-        self.out[0, 2] = np.sum(mu * self.rows[0, :n] * np.expm1(alpha * (e2 - e1)), axis=0)
-        self.s1, self.s2, self.gap, self.s11, self.s12, self.s22 = (self.out[:, q] for q in range(6))
-        self.reach = self.rows[:, -1]
-
-    def extend(self, k: int, d1: Array, d2: Array) -> None:
-        """Coefficient ``k >= 1`` from ``d1 = k e1_k`` and ``d2 = k e2_k``."""
-        self.rates[k] = self.by_e1 * d1 + self.by_e2 * d2
-        if k == 1:
-            self.rates[1, -1] += 1.0
-        self.rows[k] = np.einsum("irb,irb->rb", self.rates[1 : k + 1], self.rows[k - 1 :: -1]) / k
-        self.out[k] = np.einsum("qrb,rb->qb", self.mix, self.rows[k])
-
-
-def _taut_series(states: _States, x: Array, start: Array, order: int) -> Array:
-    """Coefficients of (e1, e2, natural = e2, theta, w) about ``x``, shape (order + 1, 5, B)."""
-    y = np.zeros((order + 1, 5, states.size))
-    y[0] = start
-    y[0, 2] = start[1]
-    film = _Film(states, order, x, y[0, 0], y[0, 1])
-    shape = (order + 1, states.size)
-    de1, de2, ratio, tilt, denominator, inner = (np.empty(shape) for _ in range(6))
-    sine, cosine, across = np.empty(shape), np.empty(shape), np.empty(shape)  # across = exp(e1 - e2)
-    sine[0], cosine[0], across[0] = np.sin(start[3]), np.cos(start[3]), np.exp(start[0] - start[1])
-    turning, spreading = np.empty(shape), np.empty(shape)  # i theta_i and i (e1 - e2)_i
-    for k in range(order):
-        if k:
-            d1, d2 = de1[k - 1], de2[k - 1]
-            film.extend(k, d1, d2)
-            turning[k], spreading[k] = k * y[k, 3], d1 - d2
-            sine[k] = np.einsum("ib,ib->b", turning[1 : k + 1], cosine[k - 1 :: -1]) / k
-            cosine[k] = np.einsum("ib,ib->b", turning[1 : k + 1], sine[k - 1 :: -1]) / -k
-            across[k] = np.einsum("ib,ib->b", spreading[1 : k + 1], across[k - 1 :: -1]) / k
-            de2[k] = _dot(across, cosine, k)
-        else:  # exp(e1 - e2) cos(theta) - 1 without cancellation
-            de2[0] = np.expm1(start[0] - start[1]) * cosine[0] - 2 * np.sin(0.5 * start[3]) ** 2
-        denominator[k] = film.s11[k] - film.s1[k]
-        inner[k] = film.s2[k] - film.s12[k]
-        _divide(film.gap[k] + _dot(inner, de2, k), de1, denominator, k)
-        _divide(film.s2[k], ratio, film.s1, k)
-        tilt[k] = _dot(across, sine, k)
-        y[k + 1, 0] = de1[k] / (k + 1)
-        y[k + 1, 1] = y[k + 1, 2] = de2[k] / (k + 1)
-        y[k + 1, 3] = -_dot(ratio, tilt, k) / (k + 1)
-        y[k + 1, 4] = _dot(film.reach, sine, k) / (k + 1)
-    return y
-
-
-def _wrinkled_series(states: _States, x: Array, start: Array, order: int) -> Array:
-    """As :func:`_taut_series`, for a zone without hoop stress: ``theta`` constant, ``natural`` wider than ``e2``."""
-    y = np.zeros((order + 1, 5, states.size))
-    y[0] = start
-    film = _Film(states, order, x, y[0, 0], y[0, 2])
-    sine, cosine = np.sin(start[3]), np.cos(start[3])
-    shape = (order + 1, states.size)
-    de1, de2, dn, slope, denominator, across, spreading = (np.empty(shape) for _ in range(7))
-    across[0] = np.exp(start[0] - start[1])
-    for k in range(order):
-        if k:
-            film.extend(k, de1[k - 1], dn[k - 1])
-            spreading[k] = de1[k - 1] - de2[k - 1]
-            across[k] = np.einsum("ib,ib->b", spreading[1 : k + 1], across[k - 1 :: -1]) / k
-            de2[k] = across[k] * cosine
-        else:
-            de2[0] = np.expm1(start[0] - start[1]) * cosine - 2 * np.sin(0.5 * start[3]) ** 2
-        _divide(-film.s12[k], slope, film.s22, k)  # dn/de1 at no hoop stress
-        denominator[k] = film.s11[k] - film.s1[k] + _dot(film.s12, slope, k)
-        _divide(-film.s1[k], de1, denominator, k)
-        dn[k] = _dot(slope, de1, k)
-        y[k + 1, 0] = de1[k] / (k + 1)
-        y[k + 1, 1] = de2[k] / (k + 1)
-        y[k + 1, 2] = dn[k] / (k + 1)
-        y[k + 1, 4] = film.reach[k] * sine / (k + 1)
-    return y
