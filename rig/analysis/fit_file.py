@@ -15,6 +15,8 @@ from rig.base.errors import ConfigError
 from rig.base.json_text import parse_json
 from rig.base.text_file import read_text
 
+MOST_TERMS = 6
+
 
 @dataclass(frozen=True)
 class FittedFilm:
@@ -33,15 +35,13 @@ def read_fit(path: Path, believed: Material) -> FittedFilm:
     ConfigError
         When the file is no result of `dea-rig fit -o`.
     """
+    fit = parse_json(read_text(path, "fit"), "a fit", str(path))
     try:
-        fit = parse_json(read_text(path, "fit"), "a fit", str(path))
-        names = tuple(str(name) for name in fit["parameters"])
-        values = {name: float(fit["quantities"][name]["value"]) for name in names}
-        covariance = np.array(fit["covariance"], dtype=float)
-        if covariance.shape != (len(names), len(names)) or not np.isfinite(covariance).all():
-            raise ValueError("its covariance is not complete")
+        names = _names(fit["parameters"])
+        values = {name: _number(fit["quantities"][name]["value"], name) for name in names}
+        covariance = _covariance(fit["covariance"], len(names))
         law = find_law(str(fit.get("law", Ogden.name)))
-        moduli, shapes = law.counts(int(fit["terms"]))
+        moduli, shapes = law.counts(_terms(fit["terms"]))
         numbers = [values[name] for name in law.names(moduli, shapes)]
         material = replace(
             believed,
@@ -52,6 +52,42 @@ def read_fit(path: Path, believed: Material) -> FittedFilm:
             source=str(path),
             law=law,
         )
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not a usable result of `dea-rig fit -o`: {error!r}.") from None
+    except KeyError as error:
+        raise ConfigError(f"{path}: not a usable result of `dea-rig fit -o`: the key {error} is missing.") from None
+    except (TypeError, ValueError, OverflowError, IndexError) as error:
+        raise ConfigError(f"{path}: not a usable result of `dea-rig fit -o`: {error}.") from None
     return FittedFilm(material, names, covariance)
+
+
+def _names(parameters: object) -> tuple[str, ...]:
+    if not isinstance(parameters, list) or not all(isinstance(name, str) for name in parameters):
+        raise ValueError("parameters must be a list of names")
+    if len(set(parameters)) < len(parameters):
+        raise ValueError("a parameter stands twice")
+    return tuple(parameters)
+
+
+def _number(value: object, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"the value of {name} must be a number")
+    return float(value)
+
+
+def _terms(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_TERMS:
+        raise ValueError(f"terms must be a whole number from 1 to {MOST_TERMS}")
+    return value
+
+
+def _covariance(rows: object, size: int) -> NDArray[np.float64]:
+    """The covariance matrix: complete, finite, symmetric, and no variance negative."""
+    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == size for row in rows):
+        raise ValueError(f"the covariance must have {size} rows of {size} numbers")
+    covariance = np.array([[_number(value, "the covariance") for value in row] for row in rows]).reshape(-1, size)
+    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
+        raise ValueError("its covariance is not complete")
+    if (np.diag(covariance) < 0).any():
+        raise ValueError("its covariance holds a negative variance")
+    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0):
+        raise ValueError("its covariance is not symmetric")
+    return covariance

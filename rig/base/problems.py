@@ -115,7 +115,8 @@ class Place:
 
     @property
     def name(self) -> str:
-        return printable(", ".join(self.keys)) or "(the file as a whole)"
+        names = (key if len(key) <= 60 else f"{key[:57]}..." for key in self.keys)
+        return printable(", ".join(names)) or "(the file as a whole)"
 
 
 def place_of(table: type[BaseModel], raw: Any, location: Sequence[int | str]) -> Place:
@@ -229,7 +230,7 @@ def _words(place: Place, problem: ErrorDetails) -> str:
 def _near(place: Place, problem: ErrorDetails) -> str:
     """The allowed key that is most like the unknown one."""
     allowed = sorted({name for one in place.tables for name in one.model_fields})
-    near = difflib.get_close_matches(str(problem["loc"][-1]), allowed, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(str(problem["loc"][-1])[:60], allowed, n=1, cutoff=0.5)
     return near[0] if near else ""
 
 
@@ -305,7 +306,7 @@ def _number_needed(value: object, *, whole: bool) -> str:
 
 
 def _one_of(value: str, allowed: list[str]) -> str:
-    near = difflib.get_close_matches(value, allowed, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(value[:60], allowed, n=1, cutoff=0.5)
     hint = f"did you mean {shown(near[0])}? " if near else ""
     return f"{hint}allowed are {', '.join(shown(one) for one in allowed)}"
 

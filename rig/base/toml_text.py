@@ -17,6 +17,7 @@ from rig.base.text import control_in, printable
 MAX_PARTS = 12  # of a dotted key
 MAX_DEPTH = 24  # of lists and inline tables
 MAX_DIGITS = 40  # of one number
+MAX_TOKENS = 80_000  # words and signs: some 10 000 keys
 MAX_VALUES = 100_000
 SHOWN = 72  # letters of a line in an error
 
@@ -50,7 +51,9 @@ def _check_nesting(text: str, kind: str, source: str) -> None:
     """Refuse what only an accident or an attacker nests so deeply."""
     parts, depth = 0, 0
     awaits_part = False  # after a dot
-    for name, token, at in _tokens(text):
+    for number, (name, token, at) in enumerate(_tokens(text)):
+        if number > MAX_TOKENS:
+            raise ConfigError(f"{source}: holds more than a {kind} file can need; this is not one.")
         if name == "open":
             depth += 1
         elif name == "close":

@@ -1,0 +1,113 @@
+"""``dea-rig init``: a folder with scene, protocols and certificates for a film that one has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rig.cli.files import FOLDER
+
+if TYPE_CHECKING:
+    from rig.analysis.first_bench import Film
+
+RADIUS = click.FloatRange(min=0, min_open=True)
+
+
+@click.command("init")
+@click.argument("folder", type=FOLDER)
+@click.option("--preset", help="The film: parker, vhb-4905, vhb-4910, elastosil-2030, ecoflex-00-30, sylgard-184.")
+@click.option("--disk-radius-mm", type=RADIUS, help="Radius of the disk.")
+@click.option("--ring-radius-mm", type=RADIUS, help="Inner radius of the ring.")
+@click.option("--prestretch", type=click.FloatRange(1, 6), help="Stretched over original length; 1 is none.")
+@click.option("--thickness-um", type=RADIUS, help="Of the film before pre-stretch; default: as sold.")
+@click.option("--name", default="film-1", show_default=True, help="Of this specimen.")
+@click.option("--no-hv", is_flag=True, help="A bench without high voltage.")
+@click.option("--no-laser", is_flag=True, help="A bench without a displacement sensor.")
+@click.option("--yes", is_flag=True, help="Ask nothing: usual values for what is not given.")
+def command(
+    folder: Path,
+    preset: str | None,
+    disk_radius_mm: float | None,
+    ring_radius_mm: float | None,
+    prestretch: float | None,
+    thickness_um: float | None,
+    name: str,
+    no_hv: bool,
+    no_laser: bool,
+    yes: bool,
+) -> None:
+    """Write scene.toml, protocols/ and certificates/ into a new FOLDER, every key explained.
+
+    The scene runs on the simulated bench; give its instruments ports, and it runs on yours. What is not given as an
+    option is asked.
+    """
+    from rig.analysis.first_bench import Film
+    from rig.base.errors import ConfigError
+    from rig.scene.presets import PRESETS
+
+    if folder.exists():
+        raise ConfigError(f"{folder} exists already; nothing is overwritten. Name a new folder.")
+    if not folder.absolute().parent.is_dir():
+        raise ConfigError(f"{folder}: its folder {folder.parent} does not exist.")
+
+    def asked(text: str, given: float | None, usual: float) -> float:
+        if given is not None:
+            return given
+        return usual if yes else float(click.prompt(text, default=usual, type=float))
+
+    if preset is None:
+        preset = "parker" if yes else click.prompt("Film", type=click.Choice(list(PRESETS)), default="parker")
+    if preset not in PRESETS:
+        raise ConfigError(f"--preset {preset}: there is no such film; there are {', '.join(PRESETS)}.")
+    known = PRESETS[preset]
+    film = Film(
+        preset=known,
+        name=name,
+        disk_radius_mm=asked("Radius of the disk / mm", disk_radius_mm, 5.0),
+        ring_radius_mm=asked("Inner radius of the ring / mm", ring_radius_mm, 25.0),
+        thickness_um=asked("Thickness before pre-stretch / um", thickness_um, known.thicknesses_um[0]),
+        prestretch=asked("Pre-stretch, 1 is none", prestretch, known.prestretch),
+    )
+    made = _write(film, folder, hv=not no_hv, displacement=not no_laser)
+    for path in made:
+        click.echo(f"written: {path}")
+    scene, sweep, log = folder / "scene.toml", folder / "protocols" / "sweep.toml", folder / "run.mcap"
+    click.echo(f"Film: {known.source}.")
+    click.echo("Next:")
+    click.echo(f"  dea-rig check {scene} {sweep}")
+    click.echo(f"  dea-rig run {scene} {sweep} -o {log}")
+    click.echo(f"  dea-rig fit {log} -o {folder / 'fit.json'} --report {folder / 'report.html'}")
+
+
+def _write(film: Film, folder: Path, *, hv: bool, displacement: bool) -> list[Path]:
+    """All files at once: the folder appears when every protocol has passed `check` on the scene, or not at all."""
+    import shutil
+    from importlib.resources import as_file, files
+    from tempfile import TemporaryDirectory
+
+    from rig.analysis.first_bench import certificate_texts, extent, protocol_texts, scene_text
+    from rig.base.errors import ConfigError
+    from rig.protocol.experiment import prepare
+
+    reach = extent(film)
+    texts = {"scene.toml": scene_text(film, reach, hv=hv, displacement=displacement)}
+    for role, text in certificate_texts(reach, hv=hv, displacement=displacement).items():
+        texts[f"certificates/{role}.toml"] = text
+    protocols = protocol_texts(reach, hv=hv)
+    texts |= {f"protocols/{name}.toml": text for name, text in protocols.items()}
+    try:
+        with TemporaryDirectory(prefix=".dea-rig-init-", dir=folder.absolute().parent) as parent:
+            part = Path(parent) / folder.name
+            with as_file(files("sim_fixtures") / "schema") as schema:
+                shutil.copytree(schema, part / "schema")
+            for name, text in texts.items():
+                (part / name).parent.mkdir(exist_ok=True)
+                (part / name).write_text(text, encoding="utf-8")
+            for name in protocols:
+                prepare(part / "scene.toml", part / "protocols" / f"{name}.toml")
+            part.rename(folder)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be written: {error.strerror}.") from None
+    return [folder / name for name in texts]
