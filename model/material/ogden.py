@@ -90,10 +90,9 @@ class Ogden(Law):
 
     @classmethod
     def point(cls, mu: Sequence[float], alpha: Sequence[float]) -> Point:
-        base = math.fsum(m * a for m, a in zip(mu, alpha, strict=True))
         if len(mu) == 1:
             (mu1,), (alpha1,) = mu, alpha
-            own1 = mu1 * alpha1
+            base = own1 = mu1 * alpha1
 
             def one(log1: float, log2: float) -> tuple[float, float, float, float, float]:
                 x, y, z = expm1(alpha1 * log1), expm1(alpha1 * log2), expm1(-alpha1 * (log1 + log2))
@@ -104,6 +103,7 @@ class Ogden(Law):
         if len(mu) == 2:
             (m1, m2), (a1, a2) = mu, alpha
             p1, p2 = m1 * a1, m2 * a2
+            base = p1 + p2
 
             def two(log1: float, log2: float) -> tuple[float, float, float, float, float]:
                 log3 = -(log1 + log2)
@@ -120,6 +120,7 @@ class Ogden(Law):
 
             return two
         terms = tuple((m, a, m * a) for m, a in zip(mu, alpha, strict=True))
+        base = math.fsum(product for _, _, product in terms)
 
         def many(log1: float, log2: float) -> tuple[float, float, float, float, float]:
             log3 = -(log1 + log2)

@@ -54,6 +54,7 @@ STEP_SHARE = 0.1  # of the tolerance: error that one step may add, as many steps
 EMBEDDED_FACTOR = 0.1  # error of a step over the estimate, which is the embedded method's: held to the truth by tests
 FIRST_SHARE = 0.02  # of a stretch of the history: its first step
 MOST_REJECTED = 40  # steps in a row without success: there is no state
+LEAST_STEP = 1e-5  # of the shorter of a stretch of the history and the shortest relaxation time: the same
 FLAT = 1e-9  # height over ring radius that stands for the flat film
 INNER_STEPS, INNER_CHANGE = 30, 1e-13  # Newton's method for the strain of a branch at a point
 MORE_MODES = 2  # than an elastic film of the same tolerance: the viscous strain is a field of its own
@@ -360,6 +361,7 @@ def _march(stepper: Stepper, times: Array, found: _Answers, scale: float, allowe
     error = 0.0
     for left, right in zip(stepper.t[:-1].tolist(), stepper.t[1:].tolist(), strict=True):
         dt = FIRST_SHARE * (right - left)
+        shortest = LEAST_STEP * min([right - left, *stepper.time.ravel().tolist()])
         failures = 0
         while stepper.now < right:
             rest = right - stepper.now
@@ -376,7 +378,7 @@ def _march(stepper: Stepper, times: Array, found: _Answers, scale: float, allowe
                 rejected += 1
                 failures += 1
                 dt *= min(factor, 0.7)
-                if failures > MOST_REJECTED:
+                if failures > MOST_REJECTED or dt < shortest:
                     later = np.flatnonzero(times > stepper.now)
                     found.end(later, stepper.lost(step))
                     return steps, rejected

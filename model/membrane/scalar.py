@@ -203,7 +203,9 @@ class Solver:
                 b = field * exp(2.0 * (log1 + log2))
                 t1 -= b
                 t2 -= b
-                rest = max(rest, abs(b / t1))
+                share = abs(b / t1)
+                if share > rest:
+                    rest = share
                 b += b
                 h11 -= b
                 h12 -= b

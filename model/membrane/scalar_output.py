@@ -105,7 +105,8 @@ def _taut(solver: Solver, panel: Panel, lam: float) -> tuple[tuple[Floats, ...],
         both = twice * t2 / (1.0 + e) + on_q
         at_disk += disk[i] * both + disk_slope[i] * on_q * dxi
         at_ring += ring[i] * both + ring_slope[i] * on_q * dxi
-        softening = max(softening, 2.0 * b / (h11 + 2.0 * b))
+        if b != 0.0:
+            softening = max(softening, 2.0 * b / (h11 + 2.0 * b))
         areas.append(log1 + log2)
         hoops.append(-t2)
         meridionals.append(-t1)

@@ -258,6 +258,15 @@ def test_beyond_pull_in_there_is_a_status_and_no_number() -> None:
     assert np.isnan(found.force[2]) and np.isnan(found.error_estimate[2]) and np.isnan(found.peak_field[2])
 
 
+def test_a_film_that_its_branches_push_slack_has_a_status_and_no_number() -> None:
+    """Pushed, held and pulled back at once, a film without pre-stretch is too long for its frame."""
+    specimen = film([(2.0, 1.0)], lp=1.0)
+    found = solve_history(specimen, [0, 5, 5.3, 8], [0, 10e-3, 1e-3, 1e-3], 0.0, [4.0, 5.0, 5.3, 8.0], tolerance=1e-5)
+    assert (found.status[:2] == Status.TAUT).all() and (found.status[2:] > Status.WRINKLED).all()
+    assert np.isfinite(found.force[:2]).all() and np.isnan(found.force[2:]).all()
+    assert found.steps + found.rejected < 500  # it does not try for ever
+
+
 def test_elastic_solutions_do_not_load_it() -> None:
     code = "import sys, model.membrane.solve, calibration.film.identify; print('model.membrane.history' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
