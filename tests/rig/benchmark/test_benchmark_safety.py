@@ -14,18 +14,28 @@ from rig.benchmark.stand import Stand
 
 
 def test_the_report_tells_what_never_went_off(tmp_path: Path) -> None:
-    rows = [Row(KILLED, [10.0, 20.0, 60.0], without=2, never=1), Row(BEATS, [20.0, 21.0]), Row(MODEL)]
+    rows = [Row(KILLED, [10.0, 20.0, 60.0], without=2, never=1, loads=[3.0]), Row(BEATS, [20.0, 21.0]), Row(MODEL)]
     report = Report(False, rows, {"processors": "2"})
     assert rows[0].quantile(0.5) == 20.0 and math.isnan(rows[2].quantile(0.5))
     save(report, tmp_path / "out")
     written = json.loads((tmp_path / "out" / "safety.json").read_text())
-    assert written["rows"][0] == {"what": KILLED, "ms": [10.0, 20.0, 60.0], "without": 2, "never": 1}
+    assert written["rows"][0] == {"what": KILLED, "ms": [10.0, 20.0, 60.0], "without": 2, "never": 1, "loads": [3.0]}
     assert written["allowed_ms"][KILLED] == 50.0
     assert (tmp_path / "out" / "safety.png").read_bytes().startswith(b"\x89PNG")
     console = Console(width=120, record=True, file=(tmp_path / "shown").open("w"))
     console.print(render(report))
     line = next(line for line in console.export_text().splitlines() if KILLED in line)
-    assert [cell.strip() for cell in line.strip("│ ").split("│")] == [KILLED, "3", "2", "20", "56", "60", "50", "1"]
+    assert [cell.strip() for cell in line.strip("│ ").split("│")] == [
+        KILLED,
+        "3",
+        "2",
+        "20",
+        "56",
+        "60",
+        "50",
+        "1",
+        "3.0",
+    ]
     console.file.close()
 
 
