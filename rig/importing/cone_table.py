@@ -310,7 +310,8 @@ def _against_the_cone(name: str, h: Array, force: Array, specimen: Specimen, sou
         "implausible",
         f"{name}: displacement {1e3 * h[k]:.4g} mm with force {measured:.4g} N is implausible for this cone, "
         f"for which {told} "
-        f"is expected (a film {ratio:.3g} times as stiff as believed)"
+        f"is expected"
+        + (f" (a film {ratio:.3g} times as stiff as believed)" if np.isfinite(ratio) else "")
         + (
             ": displacement and force look exchanged"
             if looks_swapped
@@ -487,11 +488,13 @@ def _with_known_voltage(
     if not curves or source.options.voltage or float(np.abs(part.values["voltage"]).max()) > LEVEL_V:
         return curves
     largest = max(float(curve.force.max()) for curve in curves)
+    highest = float(np.abs(part.values["voltage"]).max())
+    read = "zero" if highest == 0.0 else f"at most {highest:.3g} V"
     differ = max((_difference(curves[0], curve) for curve in curves[1:]), default=0.0)
     if differ > SWEEPS_DIFFER * largest:
         findings.warning(
             "voltage",
-            f"{name}: the voltage is zero throughout, and the sweeps differ by {differ / largest:.0%} of the "
+            f"{name}: the voltage is {read} throughout, and the sweeps differ by {differ / largest:.0%} of the "
             f"largest force: was the "
             "monitor not connected, or does the film soften? Only the first sweep is used; no permittivity",
             "--voltage 0,1000,1500 states the voltage of each sweep in turn",
@@ -499,7 +502,7 @@ def _with_known_voltage(
         return curves[:1]
     findings.warning(
         "voltage",
-        f"{name}: the voltage is zero throughout; no permittivity can be found",
+        f"{name}: the voltage is {read} throughout; no permittivity can be found",
         "--voltage 0,1000,1500 states the voltage of each sweep in turn",
     )
     return curves

@@ -152,9 +152,9 @@ def split_unit(text: str) -> tuple[str, str, Unit | None]:
     for pattern in (
         r"\s+(?:in|en)\s+(\S+)$",
         r"\s+/\s*(\S+)$",
+        r"[_\s:;]+([^\s_:;]+)$",
         r"(?<=\w)/\s*([^\d\s/]\S*)$",
         r"\s*,\s*(\S+)$",
-        r"[_\s:;]+([^\s_:;]+)$",
     ):
         found = re.search(pattern, text)
         unit = unit_of(found[1]) if found else None

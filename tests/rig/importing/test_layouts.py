@@ -367,3 +367,30 @@ def test_two_hundred_thousand_rows_take_seconds(tmp_path: Path) -> None:
     (test,) = read_sheet_tests([path]).tests
     assert time.process_time() - begun < 5.0
     assert test.stretch1.size == count and math.isclose(test.stretch1[-1], 2.0, rel_tol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("heading", "quantity", "unit"),
+    [
+        ("Stress N/mm2", "stress", "N/mm2"),
+        ("F_raw_mV/V", "other", "mV/V"),
+        ("Dehnung/%", "strain", "%"),
+        ("Kraft in N", "force", "N"),
+        ("Spannung [kV]", "voltage", "kV"),
+        ("Spannung [MPa]", "stress", "MPa"),
+        ("Elongation (mm)", "displacement", "mm"),
+        ("Élongation (%)", "strain", "%"),
+        ("Tension (V)", "voltage", "V"),
+        ("load_cell", "force", None),
+        ("λ", "stretch", None),
+        ("Strain rate (1/s)", "other", "1/s"),
+        ("hv_V", "voltage", "V"),
+        ("nominal_stress_mpa", "stress", "MPa"),
+    ],
+)
+def test_headings_are_understood(heading: str, quantity: str, unit: str | None) -> None:
+    from rig.importing.headings import understand
+
+    found = understand(heading)
+    assert found.quantity == quantity
+    assert (found.unit.name if found.unit else None) == unit
