@@ -233,3 +233,27 @@ def test_the_optimum_is_the_best_that_an_independent_search_finds(name: str, rel
     terms = 3 if test.stretch1.size > 10 else 2
     fit = fit_tests([test], terms=terms, weighting="relative" if relative else "balanced")
     assert fit.cost <= 1.001 * independent_best([test], terms, relative)
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        ["treloar1944_uniaxial", "treloar1944_equibiaxial", "treloar1944_pure_shear"],
+        ["kawabata1981_biaxial"],
+        ["vhb4910_uniaxial_equilibrium_hossain2012"],
+    ],
+)
+@pytest.mark.parametrize("terms", [1, 2])
+def test_what_is_identified_stands_under_another_weighting(files: list[str], terms: int) -> None:
+    if not DATA.is_dir():
+        pytest.skip("the published data are not there")
+    tests = [load_test(DATA / f"{name}.csv") for name in files]
+    fits = {
+        weighting: fit_tests(tests, terms=terms, weighting=weighting).quantities
+        for weighting in ("balanced", "relative", "absolute")
+    }
+    for one in fits.values():
+        for name, quantity in one.items():
+            if quantity.verdict == "identified":
+                for other in fits.values():
+                    assert abs(other[name].value - quantity.value) <= 2.0 * quantity.uncertainty, name
