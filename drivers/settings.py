@@ -43,15 +43,15 @@ class InstrumentSettings(Table):
         default=0.25,
         gt=0,
         le=10,
-        description="How long to wait for each answer before it is asked again (s). Typical: 0.1 to 0.5.",
+        description="How long to wait for each answer (s). Typical: 0.1 to 0.5.",
     )
     serial: str | None = Field(
         default=None,
-        description="Serial number that the instrument must state, or the run is refused. Absent: any is taken.",
+        description="Serial number that it must state, else the run is refused. Absent: any.",
     )
     certificate: str | None = Field(
         default=None,
-        description="Calibration certificate, a TOML file seen from the scene. Absent: its values are taken as stated.",
+        description="Calibration certificate, seen from the scene. Absent: values as stated.",
     )
 
     @property
@@ -143,7 +143,7 @@ class TcpSettings(InstrumentSettings):
     host: str | None = Field(
         default=None,
         min_length=1,
-        description='Address of the device, e.g. "192.168.1.207"; its maker\'s software shows it. Absent: simulated.',
+        description='Address of the device, e.g. "192.168.1.207". Absent: simulated.',
     )
     tcp_port: int = Field(default=502, ge=1, le=65_535, description="TCP port on which the device listens.")
 
@@ -194,5 +194,5 @@ class SupplySettings(InstrumentSettings):
         json_schema_extra={"usual": [1, 20000]},
     )
     parallel_capacitance_nF: NotNegative = Field(
-        default=0.0, description="Capacitance of cable and output beside the film (nF); it takes charging current too."
+        default=0.0, description="Capacitance of cable and output beside the film (nF), charged as well."
     )

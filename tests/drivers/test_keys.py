@@ -73,7 +73,6 @@ labjack-amplifier     enable_line              None  0   22
 labjack-amplifier     watchdog_s               3     1   60
 labjack-amplifier     proof_V                  50.0  (0  55
 labjack-amplifier     proof_tolerance          0.15  (0  0.5
-labjack-amplifier     settle_s                 0.2   0   5
 labjack-amplifier     poll_rate_Hz             20.0  2   100
 labjack-force         timeout_s                0.25  (0  10
 labjack-force         tcp_port                 502   1   65535

@@ -33,14 +33,14 @@ _TYPED = tuple(field.name for field in fields(Amplifier) if field.name != "polar
 
 
 class AmplifierSettings(SupplySettings, TcpSettings):
-    """An analogue HV amplifier, its input on a DAC and its monitors on inputs of a LabJack."""
+    """An analogue HV amplifier, driven and measured by a LabJack."""
 
     measures_current: ClassVar[bool] = True
 
     driver: Literal["labjack-amplifier"] = Field(description="Analogue HV amplifier through a LabJack T4, T7 or T8.")
     preset: Literal["trek-610e", "trek-609e-6", "ultravolt-5hva", "matsusada-amt-5b20"] | None = Field(
         default=None,
-        description="Amplifier whose data-sheet values hold where a key below is absent; check them against your unit.",
+        description="Amplifier whose data-sheet values hold for absent keys; check them.",
     )
     gain_V_per_V: Positive | None = Field(default=None, description="Output per input (V/V). Typical: 1000.")
     voltage_monitor_V_per_V: Positive | None = Field(
@@ -60,7 +60,7 @@ class AmplifierSettings(SupplySettings, TcpSettings):
         default=None,
         ge=0,
         le=22,
-        description="Digital line that enables the output; 0: FIO0, 8: EIO0, 16: CIO0. Absent: there is none.",
+        description="Digital line that enables it; 0: FIO0, 8: EIO0. Absent: there is none.",
     )
     enable_high: bool = Field(
         default=False, description="Whether a high level enables; a line that floats after power-up is high."
@@ -69,7 +69,7 @@ class AmplifierSettings(SupplySettings, TcpSettings):
         default=3,
         ge=1,
         le=60,
-        description="After how long without its key the device takes the output off by itself (s). Typical: 2 to 5.",
+        description="The device goes off this long after its last key (s). Typical: 2 to 5.",
     )
     proof_V: float = Field(
         default=50.0, gt=0, le=55, description="Step that proves gain and monitor before the output is used (V)."
@@ -77,12 +77,11 @@ class AmplifierSettings(SupplySettings, TcpSettings):
     proof_tolerance: float = Field(
         default=0.15, gt=0, le=0.5, description="How far off that step may show, relative. Typical: 0.05 to 0.2."
     )
-    settle_s: float = Field(default=0.2, ge=0, le=5, description="How long the output settles after that step (s).")
     poll_rate_Hz: float = Field(
         default=20.0,
         ge=2,
         le=100,
-        description="How often monitors and outputs are read (Hz); the ramp is made in steps at this rate.",
+        description="How often monitors are read and the ramp makes a step (Hz).",
     )
 
     @model_validator(mode="after")

@@ -26,7 +26,7 @@ NEEDED: dict[str, dict[str, Any]] = {
     "labjack-force": {"newtons_per_V": 1.0},
     "labjack-displacement": {"mm_per_V": 1.0},
 }
-NOT_IN_A_SCENE = {"poll_interval_s"}  # how the driver works, no fact of the instrument
+NOT_IN_A_SCENE = {"poll_interval_s", "settle_s"}  # how the driver works, no fact of the instrument
 
 
 @pytest.mark.parametrize("one", registered().instruments.values(), ids=lambda one: one.driver)
