@@ -27,7 +27,7 @@ from rig.steps import registry as steps
 
 FIXTURES = Path(str(files("sim_fixtures")))
 SHIPPED = {"scenes": "scene", "protocols": "protocol", "calibrations": "certificate", "studies": "study"}
-SCREEN = 50  # lines
+SCREEN = 65  # lines
 
 
 def keys(*arguments: str) -> str:

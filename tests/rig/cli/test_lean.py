@@ -84,7 +84,7 @@ def test_a_run_without_hv_on_real_ports_starts_no_guard_and_imports_no_can() -> 
 
 
 CONTROL = {"rig", "rig.cli", "rig.cli.app", "rig.cli.files", "rig.cli.talk", "rig.operator", "rig.operator.live"}
-CONTROL |= {"rig.base", "rig.base.errors", "rig.base.clock"}
+CONTROL |= {"rig.base", "rig.base.errors", "rig.base.clock", "rig.base.text", "rig.base.terminal"}
 
 
 @pytest.mark.parametrize("word", ["stop", "pause", "continue"])
