@@ -104,7 +104,11 @@ SCENES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "an open table": ("[limits]", "[limits", ("[limits", "bracket")),
     "unequal lists": ("alpha = [2.0, 5.0]", "alpha = [2.0]", ("mu_Pa has 2", "alpha has 1")),
     "no list": ("alpha = [2.0, 5.0]", "alpha = 2.0", ("alpha = 2.0", "square brackets", "[2.0]")),
-    "an unknown instrument": ('"keyence-lkg"', '"keyence"', ("displacement", "driver = ", '"keyence"', '"keyence-lkg"')),
+    "an unknown instrument": (
+        '"keyence-lkg"',
+        '"keyence"',
+        ("displacement", "driver = ", '"keyence"', '"keyence-lkg"'),
+    ),
     "a list for a name": ('driver = "gsv8"', 'driver = ["gsv8"]', ("force", "driver")),
     "an unknown material": (
         SCENE[SCENE.index("[specimen.material]") : SCENE.index("[limits]")],
