@@ -353,7 +353,7 @@ def state(
         propagation.quantity(partial(secant_modulus, meridional=stretch, hoop=hoop), gradient(a, b), "Pa")
         for stretch, a, b in zip(stretches, by_mu, by_alpha, strict=True)
     ]
-    at = min(range(len(along)), key=lambda k: along[k].relative)
+    at = min(range(len(along)), key=lambda k: _by_data(along[k]))
     quantities["stiffness"] = along[at]
     fixed = (round(FIXED * hoop, 2), hoop) if fixed_stretch is None else fixed_stretch
     _, fixed_mu, fixed_alpha = secant(film, np.array([fixed[0]]), fixed[1])
@@ -437,6 +437,14 @@ def _law_parameters(problem: Problem, held: Collection[str]) -> list[tuple[str, 
     if problem.law.series:
         found.sort(key=lambda one: one[2])
     return [one for one in found if one[0] not in held]
+
+
+def _by_data(quantity: Quantity) -> float:
+    """Relative uncertainty without what no data at any stretch can change: where it is least, they tell most."""
+    passed = (*OF_DIMENSIONS.values(), "eccentricity", "displacement axis", "voltage at the film")
+    if not math.isfinite(quantity.uncertainty):
+        return math.inf
+    return math.hypot(*(size for part, size in quantity.budget.items() if part not in passed)) / abs(quantity.value)
 
 
 def _entry(name: str, k: int, film: Material) -> float:

@@ -45,7 +45,7 @@ def whole() -> proposal.Proposal:
 def test_samples_that_stand_for_many_have_less_noise_of_either_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     """A force sensor so quiet that the noise of the laser counts: the expected uncertainty stays the same."""
     scene, _ = load_scene(SCENE)
-    certificates = certificates_of(scene, SCENE.parent)
+    certificates = certificates_of(scene, SCENE)
     certificates["force"] = replace(certificates["force"], noise=1e-4)
     film = scene.specimen.specimen().with_material(ONE_TERM)
     sweep = proposal._sweep(scene, certificates, 300.0, 12e-3, 1500.0)
@@ -149,7 +149,7 @@ def test_the_command_writes_the_protocol_and_never_over_another(tmp_path: Path) 
     assert CliRunner().invoke(main, arguments).exit_code == 2
     refused = CliRunner().invoke(main, ["plan", scene, "--time", "3min", "--fit", scene])
     assert refused.exit_code == 2
-    assert "not a usable result of `dea-rig fit -o`" in refused.output
+    assert "not a JSON file of a fit" in refused.output
 
 
 # --- simulated experiments
@@ -158,7 +158,7 @@ def test_the_command_writes_the_protocol_and_never_over_another(tmp_path: Path) 
 def experiment(protocol: Protocol, seed: int) -> list[Curve]:
     """Of a one-term film; the fit starts from the scene's guess."""
     scene, _ = load_scene(SCENE)
-    return simulated(protocol, scene, certificates_of(scene, SCENE.parent), ONE_TERM, seed)
+    return simulated(protocol, scene, certificates_of(scene, SCENE), ONE_TERM, seed)
 
 
 @pytest.mark.slow

@@ -45,7 +45,8 @@ def test_the_truth_is_within_three_stated_uncertainties_and_they_are_small(
         "eps_r": TRUTH.eps_r,
         "stiffness": secant_modulus(TRUTH, at["meridional_stretch"], at["hoop_stretch"]),
     }[name]
-    assert quantity["standard_uncertainty"] < 0.015 * truth
+    assert quantity["standard_uncertainty_given_dimensions"] < 0.03 * truth
+    assert quantity["standard_uncertainty"] < 0.08 * truth  # 5 % of the thickness, which nobody measured
     assert abs(quantity["value"] - truth) < 3 * quantity["standard_uncertainty"]
 
 
