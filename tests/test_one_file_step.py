@@ -93,6 +93,8 @@ def test_the_step_is_checked_run_recorded_and_replayed(other_package: Path) -> N
     checked = dea_rig(other_package, "check", scene, protocol)
     assert checked.returncode == 0, checked.stderr
     assert "knock: knock 3" in checked.stdout
+    told = dea_rig(other_package, "keys", "knock")
+    assert told.returncode == 0 and "How deep (mm). Typical: 0.5 to 1." in told.stdout, told.stderr
     done = dea_rig(other_package, "run", scene, protocol, "-o", log)
     assert done.returncode == 0, done.stderr
     replayed = dea_rig(other_package, "replay", log)
