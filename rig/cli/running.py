@@ -33,6 +33,8 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
             "--yes on the command line" if yes else "",
             "--take-down on the command line" if take_down else "",
         )
-    with Display(f"{word}: {kind}. {scene.specimen.name}: {experiment.protocol.title}") as display:
-        outcome = run_experiment(experiment, out, display.update, consent, display.say)
+    with Display(f"{word}: {kind}. {scene.specimen.name}: {experiment.protocol.title}", word) as display:
+        outcome = run_experiment(
+            experiment, out, lambda done, total, label: None, consent, display.say, show=display.show
+        )
     tell(f"{word}: {out}: {outcome.reason} after {outcome.duration:.0f} s; {outcome.state}.", "stdout")

@@ -281,6 +281,7 @@ class Engine:
             while not self._carry_out(action, done, total):
                 self._pause(action, done, total)
             done += action.duration
+            self._show_numbers(self._doing)
             self._show(done, total, self._doing)
 
     def _carry_out(self, action: Action, done: float, total: float) -> bool:

@@ -1,4 +1,4 @@
-"""What a run shows while it goes on: a bar with the time left on a terminal, a line a step elsewhere, and words.
+"""What a run shows while it goes on: a line of numbers on a terminal, a line a step elsewhere, and words.
 
 Everything is written by a thread of its own, straight to the descriptor: a terminal that takes nothing holds up neither
 the loop nor the end of the program. What has become old before it could be shown is dropped.
@@ -16,24 +16,25 @@ from typing import Self
 
 import click
 
-from rig.base.clock import RealClock
+from rig.operator.status import Status, minutes
 
 MOST_LINES = 100  # that may wait to be shown
 LAST_S = 0.5  # at the end, for what is left to be shown
-BAR = 24  # characters
 
 
 class Display:
-    """A context; `update` and `say` return at once.
+    """A context; `show` and `say` return at once.
 
     Parameters
     ----------
     first : str
         The first line of all.
+    bench : str
+        On what kind of bench, in front of the numbers: SIMULATED or REAL PORTS.
     """
 
-    def __init__(self, first: str) -> None:
-        self._clock = RealClock()
+    def __init__(self, first: str, bench: str = "") -> None:
+        self._bench = bench
         self._lines: deque[str] = deque([first], maxlen=MOST_LINES)
         self._bar = self._shown_bar = ""
         self._label = ""
@@ -46,18 +47,15 @@ class Display:
             self._fd, self._on_terminal = -1, False
         self._thread = threading.Thread(target=self._run, name="display", daemon=True)
 
-    def update(self, done: float, total: float, label: str) -> None:
-        """How far the run has come, in seconds of its plan."""
-        part = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
-        left = f"{self._clock.now() * (1 - part) / part:4.0f} s left" if part > 0.01 else ""
+    def show(self, status: Status) -> None:
+        """Where the run stands."""
         if self._on_terminal:
-            filled = round(part * BAR)
-            text = f"{'━' * filled}{'─' * (BAR - filled)} {100 * part:3.0f} % {left:11} {label}"
-            self._bar = text[: shutil.get_terminal_size().columns - 1]
+            self._bar = status.line(shutil.get_terminal_size().columns - 1, self._bench)
             self._wake.set()
-        elif label != self._label:
-            self._label = label
-            self.say(f"  {100 * part:3.0f} %  {left:11}  {label}")
+        elif status.label != self._label:
+            self._label = status.label
+            numbers = f" ({status.numbers})" if status.numbers else ""
+            self.say(f"  {100 * status.done:3.0f} %, {minutes(status.left)} left  {status.label}{numbers}")
 
     def say(self, text: str) -> None:
         """Show a line."""

@@ -63,7 +63,11 @@ class Status:
             (self.current, 1e6, "uA", 1),
             (self.field, 1e-6, "V/um", 1),
         )
-        known = [f"{value * scale:.{digits}f} {unit}" for value, scale, unit, digits in values if math.isfinite(value)]
+        known = [
+            f"{round(value * scale, digits) + 0.0:.{digits}f} {unit}"
+            for value, scale, unit, digits in values
+            if math.isfinite(value)
+        ]
         if self.nearest and math.isfinite(self.nearest_part):
             known.append(f"{self.nearest} at {100 * self.nearest_part:.0f} % of its limit")
         return ", ".join(known)

@@ -26,6 +26,7 @@ from rig.log.writer import LogWriter
 from rig.operator.awake import kept_awake
 from rig.operator.control import Control, Keyboard, Source
 from rig.operator.signals import stop_on_signals
+from rig.operator.status import Status
 from rig.protocol.experiment import Experiment, gains_of
 from rig.run.backend import Backend
 from rig.safety.guard import ADVICE, NOT_SAFE
@@ -54,9 +55,11 @@ def run(
     consent: Consent | None = None,
     say: Callable[[str], None] = lambda text: None,
     origin: Mapping[str, Mapping[str, str]] | None = None,
+    show: Callable[[Status], None] | None = None,
 ) -> Outcome:
     """Carry the experiment out and leave a finished log at ``out``.
 
+    ``show`` is told about five times a second where the run stands, in numbers; it returns at once.
     ``origin`` is what the log says of the versions and the host that made it, by default the true ones. On the
     simulated bench in memory nobody is asked anything: every question is answered as expected, and the log says so.
     Returns the outcome of a run that ended as planned.
@@ -106,6 +109,7 @@ def run(
                 requested=consent.arm,
                 take_down=consent.take_down,
                 guard_process=backend.guard,
+                show=show,
             )
             if awake:
                 engine.recorder.event("info", "host", awake)

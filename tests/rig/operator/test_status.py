@@ -44,6 +44,10 @@ def test_what_is_not_known_is_left_out() -> None:
     assert bare.line(120) == "step 1 of 6 | 0 %, 2 min 40 s left | step 1 home: find the reference position"
 
 
+def test_noise_below_zero_is_shown_as_zero() -> None:
+    assert Status(1, 6, 0.0, 1.0, "", voltage=-0.3, current=-1e-9).numbers == "0 V, 0.0 uA"
+
+
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [(0, "0 s"), (59.4, "59 s"), (59.6, "1 min 00 s"), (3599, "59 min 59 s"), (3600, "1 h 00 min"), (-1, "0 s")],
