@@ -76,7 +76,7 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
     begin = at(problem, everyone, progress)
     found = correct(begin, grid, first(begin, grid), 1e-3, 15)
     steps = found.steps
-    current, alive = found.state, found.ok
+    current, alive = found.state, found.ok.copy()
     if not alive.all():
         late = np.flatnonzero(~alive)
         progress[late] = 0.0

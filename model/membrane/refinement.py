@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,10 @@ MOST_STEPS = 25
 # Newton's step leaves an error of about the square of its relative size; the change of the force from one resolution to
 # the next is the error of the coarser one, some times the error of the finer. Tests hold both factors to the truth.
 NEWTON_FACTOR = 0.3
-LEVEL_FACTOR = 0.5
-SOFT_LEVEL_FACTOR = 2.0  # near loss of convexity, where a finer resolution gains less
+LEVEL_FACTOR = 1.0
+# Near loss of convexity a finer resolution gains less, and two may agree by chance: the change before counts as well.
+SOFT_LEVEL_FACTOR = 2.0
+SOFT_BEFORE_FACTOR = 0.2
 ROUND_OFF = 1e-13
 # Of the meridional stress. A hoop stress below the first will not turn out positive at a finer resolution; one between
 # the second and zero is round-off.
@@ -45,18 +47,82 @@ class Iterate:
     steps: NDArray[np.intp]
     hoop: Array | None = None  # least hoop over largest meridional stress at the points, before the last step
 
-    def put(self, index: NDArray[np.intp], other: Iterate) -> None:
-        """Take over other iterates of the states at ``index``."""
-        if other.grid.breaks is not self.grid.breaks:
-            breaks = self.grid.breaks.copy()
-            breaks[:, index] = other.grid.breaks
-            self.grid = Grid.lay(self.grid.table.modes, breaks)
-        self.state.put(index, other.state)
-        for name in ("lam", "change", "tail", "stable", "ok", "hoop"):
-            values = getattr(self, name)
-            if values is not None:
-                values[index] = getattr(other, name)
-        self.steps[index] += other.steps
+    def take(self, index: ritz.Index) -> Iterate:
+        """The states at ``index``."""
+        return Iterate(
+            self.grid.take(index),
+            self.state.take(index),
+            self.lam[index],
+            self.change[index],
+            self.tail[index],
+            self.stable[index],
+            self.ok[index],
+            self.steps[index],
+            None if self.hoop is None else self.hoop[index],
+        )
+
+
+class Finished:
+    """Iterates put aside at the step that finished them, so that none depends on how long the others need."""
+
+    def __init__(self, states: int) -> None:
+        self.states = states
+        self.parts: list[tuple[NDArray[np.intp], Iterate]] = []
+        self.running = np.arange(states)
+        self.here = np.ones(states, dtype=np.bool_)  # of those running, which are not put aside yet
+        self.fresh = self.here  # which end at this step
+
+    def ending(self, ended: NDArray[np.bool_]) -> bool:
+        """Whether some ``ended`` at this step, which `put` then takes."""
+        self.fresh = ended & self.here
+        return bool(self.fresh.any())
+
+    def put(self, every: Iterate) -> bool:
+        """Put aside those of ``every`` running one that end here; whether all have."""
+        fresh = self.fresh
+        self.parts.append((self.running[fresh], every if fresh.all() else every.take(fresh)))
+        self.here = self.here & ~fresh
+        return not self.here.any()
+
+    def rest(self) -> NDArray[np.intp] | None:
+        """Those to go on with, by their place among the running ones, when the others are worth leaving behind."""
+        if 2 * np.count_nonzero(self.here) > len(self.here):
+            return None
+        rest = np.flatnonzero(self.here)
+        self.running, self.here = self.running[rest], np.ones(len(rest), dtype=np.bool_)
+        return rest
+
+    def all(self) -> Iterate:
+        """Every state's iterate, in order."""
+        if len(self.parts) == 1:
+            return self.parts[0][1]
+        order = np.argsort(np.concatenate([index for index, _ in self.parts]), kind="stable")
+        found = [part for _, part in self.parts]
+
+        def joined(values: list[Any]) -> Any:
+            return np.concatenate(values, axis=-1)[..., order]
+
+        def maybe(values: list[Any]) -> Any:
+            return joined([x for x in values if x is not None]) if values[0] is not None else None
+
+        table = found[0].grid.table
+        grid = Grid.lay(table.modes, joined([part.grid.breaks for part in found]))
+        states = [part.state for part in found]
+        relaxed = maybe([None if x.relaxed is None else np.broadcast_to(x.relaxed, x.w.shape) for x in states])
+        state = State(
+            joined([x.c for x in states]), joined([x.w for x in states]), maybe([x.natural for x in states]), relaxed
+        )
+        return Iterate(
+            grid,
+            state,
+            joined([x.lam for x in found]),
+            joined([x.change for x in found]),
+            joined([x.tail for x in found]),
+            joined([x.stable for x in found]),
+            joined([x.ok for x in found]),
+            joined([x.steps for x in found]),
+            maybe([x.hoop for x in found]),
+        )
 
 
 Settle = Callable[[Problem, Grid, State, float], Iterate]
@@ -125,26 +191,23 @@ def tail(problem: Problem, grid: Grid, state: State, step: ritz.Step) -> Array:
 
 def newton(problem: Problem, grid: Grid, state: State, goal: float, limit: int = MOST_STEPS) -> Iterate:
     """Newton from ``state`` until the slopes change by less than ``goal`` (relative); the error is then its square."""
-    states = state.w.shape[2]
-    steps = np.zeros(states, dtype=np.intp)
-    n = 0
-    while True:
-        n += 1
+    finished = Finished(state.w.shape[2])
+    for n in range(1, limit + 1):
         at = ritz.evaluate(problem, grid, state)
         step = ritz.newton(problem, grid, state, at)
         state, change = advance(state, step, at, grid)
-        steps += 1
         done = change <= goal
-        rest = np.flatnonzero(~done)
-        if len(rest) == 0 or n >= limit or (n >= 4 and len(rest) < 0.5 * states):
-            break
-    ends = tail(problem, grid, state, step)
-    hoop = at.law.t2.min(axis=(0, 1)) / at.law.t1.max(axis=(0, 1))
-    ok = done & step.stable & (step.lam > 0.0)
-    result = Iterate(grid, state, step.lam, change, ends, step.stable, ok, steps, hoop)
-    if 0 < len(rest) < states and n < limit:
-        result.put(rest, newton(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n))
-    return result
+        if finished.ending(done | (n == limit)):
+            ends = tail(problem, grid, state, step)
+            hoop = at.law.t2.min(axis=(0, 1)) / at.law.t1.max(axis=(0, 1))
+            ok = done & step.stable & (step.lam > 0.0)
+            now = Iterate(grid, state, step.lam, change, ends, step.stable, ok, np.full(len(ok), n), hoop)
+            if finished.put(now):
+                break
+        rest = finished.rest()
+        if rest is not None:
+            problem, grid, state = problem.take(rest), grid.take(rest), state.take(rest)
+    return finished.all()
 
 
 @dataclass(slots=True)
@@ -235,6 +298,7 @@ def refine(
     lost: list[NDArray[np.intp]] = []
     aim = goal(tolerance)
     previous: Array | None = None
+    before = np.full(len(index), np.inf)  # relative change of the force at the resolution before
     while True:
         result = settle(problem, start.grid, start.state, aim)
         start = Start(result.grid, result.state)
@@ -251,6 +315,9 @@ def refine(
         modes = start.grid.table.modes
         if previous is not None:
             error = estimate(lam, previous, result.change, result.tail, tolerance, factor)
+            if factor > LEVEL_FACTOR:
+                error = error + SOFT_BEFORE_FACTOR * before
+            before = np.abs((lam - previous) / lam)
             settled = np.flatnonzero(ok & (error <= tolerance))
             if len(settled):
                 part = (problem, start, lam)
@@ -270,6 +337,7 @@ def refine(
             break
         if len(rest) < len(index):
             problem, index, start, lam = problem.take(rest), index[rest], start.take(rest), lam[rest]
+            before = before[rest]
         previous = lam
         start = prolonged(start, problem, next_modes(modes))
     return answers, np.concatenate(lost), total

@@ -539,26 +539,30 @@ def careful_guess(problem: Problem, grid: Grid) -> State:
     state = guess(problem, grid)
     log_w = np.log(np.minimum(state.w, 1.0))
     log_lam = np.full(len(problem.span), np.nan)
+    w, open_ = state.w, np.ones(len(problem.span), dtype=np.bool_)  # each state stops by itself
     for outer in range(40):
+        moving = open_.copy()
         for _ in range(30 if outer == 0 else 6):
-            w = np.exp(log_w)
-            part = w * w / (1.0 + w * w)
-            log1 = 0.5 * np.log1p(w * w) + problem.log_prestretch
+            trial = np.exp(log_w)
+            part = trial * trial / (1.0 + trial * trial)
+            log1 = 0.5 * np.log1p(trial * trial) + problem.log_prestretch
             law = stress(problem.film, stack(log1, np.broadcast_to(problem.log_prestretch, log1.shape)))
-            pull = np.log(np.maximum(law.t1, 1e-300)) + np.log(grid.radius * w / (1.0 + w * w))
+            pull = np.log(np.maximum(law.t1, 1e-300)) + np.log(grid.radius * trial / (1.0 + trial * trial))
             power = np.maximum(1.0 - 2.0 * part + part * law.h11 / law.t1, 0.2)
-            if outer == 0 and not np.isfinite(log_lam).all():
-                log_lam = np.median(pull.reshape(-1, pull.shape[2]), axis=0)
+            if outer == 0:
+                log_lam = np.where(np.isfinite(log_lam), log_lam, np.median(pull.reshape(-1, pull.shape[2]), axis=0))
             step = (log_lam - pull) / power
-            log_w = log_w + np.clip(step, -0.7, 0.7)
-            if not np.abs(step).max() > 1e-6:
+            log_w = np.where(moving, log_w + np.clip(step, -0.7, 0.7), log_w)
+            moving &= np.abs(step).max(axis=(0, 1)) > 1e-6
+            if not moving.any():
                 break
-        w = np.exp(log_w)
+        w = np.where(open_, np.exp(log_w), w)
         reach = (grid.once * w).sum(axis=(0, 1))
         give = (grid.once * w / power).sum(axis=(0, 1)) / reach
         miss = np.log(problem.height / reach)
-        log_lam = log_lam + np.clip(miss / give, -2.0, 2.0)
-        if not np.abs(miss).max() > 1e-3:
+        log_lam = np.where(open_, log_lam + np.clip(miss / give, -2.0, 2.0), log_lam)
+        open_ &= np.abs(miss) > 1e-3
+        if not open_.any():
             break
     w *= problem.height / (grid.once * w).sum(axis=(0, 1))
     good = np.isfinite(w).all(axis=(0, 1))

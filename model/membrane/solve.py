@@ -194,7 +194,8 @@ def solve_many(
     specimen : one film, or a sequence or object array of films, broadcast with the others
     h, voltage : displacement of the disk (m) and voltage (V), broadcast to a shape S
     tolerance : relative error of the force to aim for, 1e-12 to 1e-2
-    wrinkling : "plain", the paper's equations whatever the hoop stress; or "tension_field", the relaxed energy
+    wrinkling : "plain", the paper's equations whatever the hoop stress, beyond the slack voltage too as long as a
+        stable state with tension along the film is found (WRINKLED); or "tension_field", the relaxed energy
     sensitivities : also give ``dforce``
 
     Returns
@@ -434,26 +435,41 @@ class _Block:
         if problem.span.max() > WIDEST:
             result.status[self.index] = Status.NOT_CONVERGED
             return
+        relaxed = wrinkling == "tension_field"
         if problem.film.field is not None:
             slack = self.slack()
-            if slack.any():
-                result.status[self.index[slack]] = Status.SLACK
+            # The plain equations may still have a state with compression around and tension along the film.
+            result.status[self.index[slack]] = Status.SLACK
+            if slack.any() and relaxed:
                 index = np.flatnonzero(~slack)
                 if len(index) == 0:
                     return
                 problem = problem.take(index)
-        relaxed = wrinkling == "tension_field"
         breaks = problem.cut()
-        grid = Grid.lay(first_modes(float(problem.span.max()) / (len(breaks) - 1), tolerance), breaks)
-        start = Start(grid, ritz.guess(problem, grid))
         folded: list[tuple[NDArray[np.intp], Start]] = []
-        answers, lost, steps = refine(
-            problem, tolerance, start, sensitivities=sensitivities, folded=folded if relaxed else None
-        )
+        answers: list[Answer] = []
+        steps = np.zeros(len(index), dtype=np.intp)
+        missed = []
+        modes = np.array([first_modes(float(span), tolerance) for span in problem.span / (len(breaks) - 1)])
+        for number in np.unique(modes).tolist():
+            some = np.flatnonzero(modes == number)
+            part = problem if len(some) == len(index) else problem.take(some)
+            grid = Grid.lay(number, breaks[:, some])
+            start, first = Start(grid, ritz.guess(part, grid)), len(folded)
+            found, left, spent = refine(
+                part, tolerance, start, sensitivities=sensitivities, folded=folded if relaxed else None
+            )
+            steps[some] += spent
+            missed.append(some[left])
+            folded[first:] = [(some[index], begin) for index, begin in folded[first:]]
+            for answer in found:
+                answer.index = some[answer.index]
+            answers += found
+        lost = np.concatenate(missed)
         doubtful = [] if relaxed else [lost]
         for answer in answers:
             x = answer.extremes
-            soft = x.softening > SOFTENING
+            soft = (x.softening > SOFTENING) | (x.meridional <= 0.0)
             wrinkled = x.hoop < ROUND_OFF_TENSION * x.meridional if relaxed else np.zeros_like(soft)
             doubtful.append(answer.index[soft & ~wrinkled])
             if wrinkled.any():
@@ -495,10 +511,12 @@ class _Block:
         """Solve states for which a cold start may have missed, or jumped from, the branch that starts at rest."""
         answers, ended = from_rest.solve(problem.take(some), tolerance, relaxed=relaxed, sensitivities=sensitivities)
         steps[some] += ended.steps
-        result.status[self.index[index[some]]] = np.where(ended.unstable, Status.UNSTABLE, Status.NOT_CONVERGED)
+        to = self.index[index[some]]
+        failed = np.where(ended.unstable, Status.UNSTABLE, Status.NOT_CONVERGED)
+        result.status[to] = np.where(result.status[to] == Status.SLACK, Status.SLACK, failed)
         for answer in answers:
             answer.index = some[answer.index]
-            self.place(result, index, answer, np.ones(len(answer.index), dtype=np.bool_))
+            self.place(result, index, answer, answer.extremes.meridional > 0.0)
 
     def slack(self) -> NDArray[np.bool_]:
         """Where the film, stretched like a straight cone, would push outwards: no tension can hold it."""

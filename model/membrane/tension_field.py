@@ -22,7 +22,7 @@ from model.arrays import Array
 from model.material.law import stack, stress
 from model.membrane import refinement, ritz
 from model.membrane.output import FINE, fine_table
-from model.membrane.refinement import Answer, Iterate, Start
+from model.membrane.refinement import Answer, Finished, Iterate, Start
 from model.membrane.ritz import Grid, Points, Problem, State
 from model.membrane.soft_cone import SoftCones
 from model.membrane.wrinkled_cone import Cones, Springs, natural_width, whole
@@ -56,35 +56,27 @@ def guess(problem: Problem, grid: Grid) -> State:
 
 def search(problem: Problem, grid: Grid, state: State, goal: float = 2e-2, limit: int = 30) -> Iterate:
     """Newton with every point taut or wrinkled by itself: no order of convergence, but it finds the zones."""
-    states = state.w.shape[2]
-    steps = np.zeros(states, dtype=np.intp)
-    n = 0
-    while True:
-        n += 1
+    finished = Finished(state.w.shape[2])
+    for n in range(1, limit + 1):
         at = ritz.evaluate(problem, grid, state)
         step = ritz.newton(problem, grid, state, at)
         new, change = refinement.advance(state, step, at, grid)
+        relief = at.law.relief
         assert state.relaxed is not None and state.natural is not None and new.natural is not None
-        assert at.law.relief is not None
+        assert relief is not None
         # A folded point stays folded while its circle is narrower than its natural width.
-        folded = np.where(state.relaxed, at.hoop < state.natural + at.law.relief.change, at.law.t2 < 0.0)
+        folded = np.where(state.relaxed, at.hoop < state.natural + relief.change, at.law.t2 < 0.0)
         flips = (folded != state.relaxed).any(axis=(0, 1))
         state = State(new.c, new.w, np.where(folded & state.relaxed, new.natural, at.hoop), folded)
-        steps += 1
         quiet = (change <= goal) & ~flips
-        if quiet.all() or n >= limit:
+        ok = quiet & step.stable & relief.regular.all(axis=(0, 1)) & (step.lam > 0.0)
+        found = Iterate(grid, state, step.lam, change, np.zeros(len(ok)), step.stable, ok, np.full(len(ok), n))
+        if finished.ending(quiet | (n == limit)) and finished.put(found):
             break
-        if n >= 5 and states > 1 and quiet.mean() > 0.5:
-            rest = np.flatnonzero(~quiet)
-            more = search(problem.take(rest), grid.take(rest), state.take(rest), goal, limit - n)
-            state.put(rest, more.state)
-            lam, stable = step.lam, step.stable
-            lam[rest], change[rest], stable[rest] = more.lam, more.change, more.stable
-            quiet[rest] = more.ok
-            steps[rest] += more.steps
-            return Iterate(grid, state, lam, change, np.zeros(states), stable, quiet & stable & (lam > 0.0), steps)
-    stable = step.stable & at.law.relief.regular.all(axis=(0, 1))
-    return Iterate(grid, state, step.lam, change, np.zeros(states), stable, quiet & stable & (step.lam > 0.0), steps)
+        rest = finished.rest()
+        if rest is not None:
+            problem, grid, state = problem.take(rest), grid.take(rest), state.take(rest)
+    return finished.all()
 
 
 def wrong_sign(tolerance: float) -> float:
@@ -202,42 +194,40 @@ def _settle(
     limit: int,
     careful: bool,
 ) -> Iterate:
-    states = film.w.shape[2]
-    steps = np.zeros(states, dtype=np.intp)
-    while True:
-        steps += 1
+    finished = Finished(film.w.shape[2])
+    for n in range(1, limit + 1):
         panels = grid.part(taut)
         at = ritz.evaluate(problem, panels, film)
         system = ritz.reduce(panels, film.w, at)
         springs = Springs.of(problem, grid, panels, cones, film.c)
         springs.join(system)
         step = ritz.solve(problem, panels, system)
-        new, change = refinement.advance(film, step, at, panels)
+        before = film
+        film, change = refinement.advance(film, step, at, panels)
         cones, bent = springs.advance(step.dc, step.lam)
         # A cut that moves carries the strains with it: they must have settled as well as the slopes.
         de, dq = panels.strain(step.dc)
-        size = (np.abs(at.q) + film.w**2).max(axis=(0, 1), initial=1e-300)
+        size = (np.abs(at.q) + before.w**2).max(axis=(0, 1), initial=1e-300)
         change = np.maximum(np.maximum(change, bent), np.abs(dq).max(axis=(0, 1), initial=0.0) / size)
         tension = at.law.t2 + at.law.h12 * (at.along * dq + at.down * step.dw) + at.law.h22 * at.around * de
         breaks, shift = _moved(grid, panels, taut, cones.which, tension)
         if careful:
             breaks = np.where(change <= CALM, breaks, grid.breaks)
         change = np.maximum(change, CUT_WEIGHT * shift)
-        # Where it has settled the state belongs to the cuts as they were.
-        grid = Grid.lay(grid.table.modes, np.where(change <= goal, grid.breaks, breaks))
-        film = new
         done = change <= goal
+        # Where it has settled the state belongs to the cuts as they were.
+        grid = Grid.lay(grid.table.modes, np.where(done, grid.breaks, breaks))
         stable = step.stable & springs.regular
-        rest = np.flatnonzero(~done)
-        if len(rest) == 0 or int(steps[0]) >= limit or len(rest) <= 0.5 * states:
-            break
-    ends = refinement.tail(problem, panels, film, step)
-    state = whole(grid, film, taut, cones.unrolled(problem, grid))
-    result = Iterate(grid, state, step.lam, change, ends, stable, done & stable & (step.lam > 0.0), steps)
-    if len(rest) > 0 and int(steps[0]) < limit:
-        some = (problem.take(rest), grid.take(rest), film.take(rest), taut, cones.take(rest))
-        result.put(rest, _settle(*some, goal, limit - int(steps[0]), careful))
-    return result
+        if finished.ending(done | (n == limit)):
+            ends = refinement.tail(problem, panels, film, step)
+            state = whole(grid, film, taut, cones.unrolled(problem, grid))
+            ok = done & stable & (step.lam > 0.0)
+            if finished.put(Iterate(grid, state, step.lam, change, ends, stable, ok, np.full(len(ok), n))):
+                break
+        rest = finished.rest()
+        if rest is not None:
+            problem, grid, film, cones = problem.take(rest), grid.take(rest), film.take(rest), cones.take(rest)
+    return finished.all()
 
 
 def _moved(
@@ -265,14 +255,13 @@ def _moved(
     return breaks, largest
 
 
-def _cut(film: Problem, edges: Array, first: bool) -> tuple[Array, NDArray[np.bool_]]:
+def _cut(film: Problem, edges: Array, first: bool, pieces: tuple[int, ...]) -> tuple[Array, NDArray[np.bool_]]:
     """Breaks at the zones' ``edges`` and inside zones that are too long, and which elements are wrinkled."""
     ends = np.concatenate((-film.span[None], edges, np.zeros((1, len(film.span)))))
     breaks, wrinkled = [ends[:1]], []
-    for number, (left, right) in enumerate(pairwise(ends)):
-        pieces = ritz.elements(right - left)
-        breaks.append(left + (right - left) * np.linspace(0.0, 1.0, pieces + 1)[1:, None])
-        wrinkled += [(number % 2 == 0) == first] * pieces
+    for number, ((left, right), many) in enumerate(zip(pairwise(ends), pieces, strict=True)):
+        breaks.append(left + (right - left) * np.linspace(0.0, 1.0, many + 1)[1:, None])
+        wrinkled += [(number % 2 == 0) == first] * many
     return np.concatenate(breaks), np.array(wrinkled)
 
 
@@ -347,28 +336,54 @@ def _round(
             if changes >= MOST_ZONES:
                 lost.append(index[some[of]])
                 continue
-            film = part.take(of)
-            breaks, wrinkled = _cut(film, zone.where[:changes, of], first)
-            modes = max(3, refinement.first_modes(float((breaks[1:] - breaks[:-1]).max()), tolerance))
-            begun = remap(grid.take(of), chosen.take(of), at.log[1][..., of], breaks, modes, wrinkled)
-            done, missed, spent = refinement.refine(
-                film, tolerance, begun, sensitivities=sensitivities, settle=settler, factor=factor
-            )
-            where = index[some[of]]
-            lost.append(where[missed])
-            steps[where] += spent
-            for answer in done:
-                solved = film.take(answer.index)
-                now = zones(
-                    answer.grid,
-                    answer.state,
-                    ritz.evaluate(solved, answer.grid, answer.state),
-                    slack=wrong_sign(tolerance),
-                    between=not careful,
+            for cut in _alike(part.take(of), zone.where[:changes, of], tolerance):
+                here_of = of[cut.index]
+                film = part.take(here_of)
+                breaks, wrinkled = _cut(film, zone.where[:changes, here_of], first, cut.pieces)
+                begun = remap(
+                    grid.take(here_of), chosen.take(here_of), at.log[1][..., here_of], breaks, cut.modes, wrinkled
                 )
-                same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
-                answer.index = where[answer.index]
-                answer.steps = steps[answer.index]
-                answers.append(answer.take(same))
-                if not same.all():
-                    again.append((answer.index[~same], Start(answer.grid, answer.state).take(~same)))
+                done, missed, spent = refinement.refine(
+                    film, tolerance, begun, sensitivities=sensitivities, settle=settler, factor=factor
+                )
+                where = index[some[here_of]]
+                lost.append(where[missed])
+                steps[where] += spent
+                for answer in done:
+                    solved = film.take(answer.index)
+                    now = zones(
+                        answer.grid,
+                        answer.state,
+                        ritz.evaluate(solved, answer.grid, answer.state),
+                        slack=wrong_sign(tolerance),
+                        between=not careful,
+                    )
+                    same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
+                    answer.index = where[answer.index]
+                    answer.steps = steps[answer.index]
+                    answers.append(answer.take(same))
+                    if not same.all():
+                        again.append((answer.index[~same], Start(answer.grid, answer.state).take(~same)))
+
+
+@dataclass(slots=True)
+class _Alike:
+    """States to be cut into as many elements and begun with as many modes."""
+
+    index: NDArray[np.intp]
+    pieces: tuple[int, ...]  # of every zone
+    modes: int
+
+
+def _alike(film: Problem, edges: Array, tolerance: float) -> list[_Alike]:
+    """Groups of the states with these zones, so that what a state gets does not depend on the others."""
+    ends = np.concatenate((-film.span[None], edges, np.zeros((1, len(film.span)))))
+    length = ends[1:] - ends[:-1]
+    pieces = np.maximum(1, np.ceil(length / ritz.LONGEST)).astype(np.intp)
+    longest = (length / pieces).max(axis=0)
+    modes = [max(3, refinement.first_modes(float(one), tolerance)) for one in longest]
+    rows, group = np.unique(np.vstack((pieces, modes)), axis=1, return_inverse=True)
+    return [
+        _Alike(np.flatnonzero(group.ravel() == k), tuple(row[:-1].tolist()), int(row[-1]))
+        for k, row in enumerate(rows.T)
+    ]

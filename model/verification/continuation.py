@@ -16,12 +16,14 @@ path ends where steps of ``LEAST`` are refused.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
+from model.material.gent import Gent
 from model.specimen import Specimen
 
 Array = NDArray[np.float64]
@@ -98,6 +100,8 @@ class _Path:
 
     def stress(self, log1: Array, log2: Array, k: float) -> tuple[Array, ...]:
         """True stresses and their derivatives in ln(l1), ln(l2); ``k`` = eps (V/T)^2."""
+        if self.film.material.law is Gent:
+            return self.gent(log1, log2, k)
         x, y = np.expm1(self.alpha * log1), np.expm1(self.alpha * log2)
         z = np.expm1(-self.alpha * (log1 + log2))
         b = k * np.exp(2.0 * (log1 + log2))
@@ -105,6 +109,20 @@ class _Path:
         s1, s2 = (self.mu * (x - z)).sum(0) - b, (self.mu * (y - z)).sum(0) - b
         through = (product * (z + 1.0)).sum(0) - 2.0 * b
         return s1, s2, (product * (x + 1.0)).sum(0) + through, through, (product * (y + 1.0)).sum(0) + through
+
+    def gent(self, log1: Array, log2: Array, k: float) -> tuple[Array, ...]:
+        """The same for ``W = -mu J/2 ln(1 - (I1 - 3)/J)``; NaN beyond its limit."""
+        mu, limit = float(self.mu[0, 0]), float(self.alpha[0, 0])
+        x, y, z, b = np.exp(2.0 * log1), np.exp(2.0 * log2), np.exp(-2.0 * (log1 + log2)), k * np.exp(2 * (log1 + log2))
+        room = 1.0 - (x + y + z - 3.0) / limit
+        room = np.where(room > 0.0, room, np.nan)
+        i1, i2 = 2.0 * (x - z), 2.0 * (y - z)
+        first = 0.5 * mu / room
+        second = first / (limit * room)
+        s11 = second * i1 * i1 + first * 4.0 * (x + z) - 2.0 * b
+        s12 = second * i1 * i2 + first * 4.0 * z - 2.0 * b
+        s22 = second * i2 * i2 + first * 4.0 * (y + z) - 2.0 * b
+        return first * i1 - b, first * i2 - b, s11, s12, s22
 
     def widths(self, log1: Array, log2: Array, k: float) -> Array:
         """First hoop strain from ``log2`` on that makes no hoop stress, in steps; NaN where there is none to be had."""
@@ -207,7 +225,7 @@ class _Path:
         full = self.film.material.permittivity * (voltage / self.film.thickness) ** 2
         return self.leg(lambda s: (h, full * s * s), start=0.0)
 
-    def leg(self, at, start: float) -> float:  # type: ignore[no-untyped-def]
+    def leg(self, at: Callable[[float], tuple[float, float]], start: float) -> float:
         """Follow one leg, ``at(share)`` giving height and ``k``; the share reached."""
         share, step = start, FIRST
         height, k = at(start)

@@ -342,3 +342,18 @@ def test_the_least_hoop_stress_inside_the_film_converges_with_the_tolerance() ->
         assert np.all(errors[-1] < 3.0 * np.sqrt(tolerance))
     assert errors[0].max() > 1e-4  # it is found inside the film: at an edge it is as good as the force
     assert errors[2].max() < 1e-8
+
+
+def test_plain_equations_are_answered_beyond_slack_while_they_hold_tension_along_the_film() -> None:
+    """Compression around, tension along: no film, but what the paper's equations say."""
+    film = Specimen(4e-3, 20e-3, 40e-6, 1.0, NAMED["parker-cao2018"])
+    voltage = np.array([2330.0, 2380.0, 2430.0])
+    plain = solve_many(film, 10e-3, voltage, tolerance=1e-8)
+    assert np.all(solve_many(film, 10e-3, voltage, wrinkling="tension_field").status == Status.SLACK)
+    truth = reference(film, 10e-3, voltage)
+    told = truth.converged
+    np.testing.assert_array_equal(plain.status[told], Status.WRINKLED)
+    assert told.any()
+    np.testing.assert_allclose(plain.force[told], truth.force[told], rtol=1e-7)
+    assert np.all(plain.min_meridional_stress[told] > 0.0)
+    assert np.all(plain.min_hoop_stress[told] < 0.0)
