@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from statistics import correlation
 
 from model.actuator.design import Row, Treatment
 
@@ -58,8 +60,15 @@ class Compared:
 
     @property
     def deviation(self) -> float | None:
-        """Ours over the paper's, minus one."""
+        """Our peak over the paper's, minus one, wherever each stands."""
         return None if self.printed.value is None else self.value / self.printed.value - 1.0
+
+    @property
+    def deviation_at_printed(self) -> float | None:
+        """Ours at the a/b of the paper's peak over the paper's, minus one."""
+        if self.printed.value is None or self.at_printed is None:
+            return None
+        return self.at_printed / self.printed.value - 1.0
 
 
 @dataclass(frozen=True)
@@ -94,12 +103,23 @@ class Claims:
                 continue
             good = ", ".join(v.claim.split(":")[0] for v in mine if v.holds) or "none"
             bad = "; ".join(f"{v.claim.split(':')[0]} ({v.evidence})" for v in mine if not v.holds) or "none"
-            off = [c.deviation for c in self.compared if c.treatment == treatment and c.deviation is not None]
+            peaks = [c for c in self.compared if c.treatment == treatment and c.printed.times == 1]
+            off = [c.deviation for c in peaks if c.deviation is not None]
+            there = [c.deviation_at_printed for c in peaks if c.deviation_at_printed is not None]
+            works = [c for c in peaks if c.printed.quantity == "work"]
+            edge = sum(c.edge for c in works)
             lines.append(
                 f"{name[0].upper()}{name[1:]}: claims that hold: {good}; that fail: {bad}. Our peaks are "
-                f"{min(off):+.0%} to {max(off):+.0%} off the printed ones; hoop tension is lost at the end of "
+                f"{min(off):+.0%} to {max(off):+.0%} off the printed ones, peak against peak"
+                + (f", and {min(there):+.0%} to {max(there):+.0%} at the printed a/b" if there else "")
+                + (f"; {edge} of {len(works)} peaks of the work stand at the map's edge" if edge else "")
+                + f"; hoop tension is lost at the end of "
                 f"{self.lost[treatment]} of {self.states[treatment]} strokes."
             )
+        lines.append(
+            "The field is the largest anywhere in the film; in plain states that have lost their hoop tension it "
+            "stands inside the film, not at the disk. The paper does not say where it takes the field."
+        )
         return lines + [f"The paper against itself: {text}" for text in self.contradictions]
 
 
@@ -185,6 +205,19 @@ def _verdicts(rows: Sequence[Row], treatment: str) -> list[Verdict]:
         all(x < BOUND_CLAIMED - 1e-9 for x in (*strokes, *works)),
         where,
     )
+    lowest = min(CASES, key=lambda case: best(flat[case], "stroke").stroke)
+    judged(
+        "e: without pre-stretch case I has the lowest stroke",
+        lowest == "I",
+        "largest d* without pre-stretch "
+        + ", ".join(f"{case} {best(mine, 'stroke').normalized_stroke:.3f}" for case, mine in flat.items()),
+    )
+    falls, straight = _straight([(row.radius_ratio, row.normalized_stroke) for row in flat["III"]])
+    judged(
+        "f: the stroke of case III falls about linearly with a/b",
+        falls and straight > LINEAR,
+        f"R^2 of a straight line {straight:.3f}" + ("" if falls else "; it does not fall all the way"),
+    )
     longest = max(CASES, key=lambda case: best(by_case[case], "stroke").stroke)
     strongest = max(CASES, key=lambda case: best(by_case[case], "work").work)
     judged(
@@ -203,6 +236,17 @@ def _verdicts(rows: Sequence[Row], treatment: str) -> list[Verdict]:
         f"largest stretch {max(row.max_stretch for row in rows):.2f}",
     )
     return verdicts
+
+
+LINEAR = 0.98  # R^2 of a straight line that is "approximately linear"
+
+
+def _straight(points: Sequence[tuple[float, float]]) -> tuple[bool, float]:
+    """Whether values fall all the way, and R^2 of a straight line through them."""
+    found = sorted(point for point in points if not math.isnan(point[1]))
+    x, y = [p[0] for p in found], [p[1] for p in found]
+    falls = all(later < earlier for earlier, later in pairwise(y))
+    return falls, correlation(x, y) ** 2 if len(found) > 2 else math.nan
 
 
 def _contradictions() -> list[str]:

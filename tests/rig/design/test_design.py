@@ -187,13 +187,31 @@ def test_claim_table_has_the_stored_numbers(claims: Claims) -> None:
     holds = {(v.claim.split(":")[0], v.treatment): v.holds for v in claims.verdicts}
     assert holds == {
         (claim, treatment): (claim, treatment)
-        not in {("a", "tension"), ("c (stroke)", "tension")} | {("b (bound)", t.value) for t in Treatment}
-        for claim in ("a", "b (order)", "b (bound)", "c (stroke)", "c (work)", "d")
+        not in {("a", "tension"), ("c (stroke)", "tension"), ("f", "tension")}
+        | {("b (bound)", t.value) for t in Treatment}
+        for claim in ("a", "b (order)", "b (bound)", "c (stroke)", "c (work)", "d", "e", "f")
         for treatment in ("plain", "tension", "tension_field")
     }
     text = "\n".join(claims.reading())
     assert "case I with its peak at a/b = 0.35" in text
     assert "lost at the end of 54 of 108 strokes" in text
+
+
+@pytest.mark.slow
+def test_the_readme_says_what_the_claims_say(claims: Claims) -> None:
+    text = " ".join((Path(__file__).parents[3] / "rig" / "design" / "README.md").read_text(encoding="utf-8").split())
+
+    def off(treatment: str, name: str) -> str:
+        values = [getattr(c, name) for c in claims.compared if c.treatment == treatment and c.printed.times == 1]
+        low, high = (round(-100 * end(v for v in values if v is not None)) for end in (max, min))
+        return f"{low} to {high} %"
+
+    assert f"peaks are {off('plain', 'deviation')} below the printed ones, peak against peak" in text
+    assert f"and {off('plain', 'deviation_at_printed')} at the a/b that the paper prints" in text
+    assert f"with peaks {off('tension_field', 'deviation')} below the printed ones" in text
+    works = [c for c in claims.compared if c.treatment == "tension_field" and c.printed.quantity == "work"]
+    assert sum(c.edge for c in works if c.printed.times == 1) == 2
+    assert "two of the three peaks of the work stand at the map's edge" in text
 
 
 @pytest.mark.slow
