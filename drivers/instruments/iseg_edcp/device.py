@@ -4,38 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
-from enum import IntFlag
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, label
+from drivers.instruments.iseg_edcp import codec as edcp
 from drivers.instruments.iseg_edcp.codec import (
-    BLOCKING,
-    CHANNEL_CONTROL,
-    CHANNEL_COUNT,
-    CHANNEL_EVENTS,
-    CHANNEL_STATUS,
-    CURRENT_BOUNDS,
-    EMERGENCY_OFF_ALL,
-    FIRMWARE_NAME,
-    FIRMWARE_RELEASE,
-    MEASURED_CURRENT,
-    MEASURED_VOLTAGE,
-    MODULE_CONTROL,
-    MODULE_EVENTS,
-    MODULE_RAMP,
-    MODULE_STATUS,
-    NOMINAL_CURRENT,
-    NOMINAL_VOLTAGE,
-    OWN_CONTROL,
-    SERIAL_NUMBER,
-    SET_CURRENT,
-    SET_VOLTAGE,
-    STATUS_BIT_5,
-    TRIP_ACTION,
-    TRIP_ACTIONS,
-    TRIP_DELAY,
-    VOLTAGE_BOUNDS,
     ChannelControl,
     ChannelEvents,
     ChannelStatus,
@@ -54,36 +28,24 @@ from drivers.instruments.iseg_edcp.codec import (
     read_request,
     write,
 )
+from drivers.instruments.iseg_edcp.exchange import (
+    ATTEMPTS,
+    EMERGENCY_AGAIN_S,
+    EMERGENCY_LOOKS,
+    EMERGENCY_OFTEN,
+    EMERGENCY_SELDOM_S,
+    SURVEY_S,
+    SWITCH_ON_LOOKS,
+    SWITCH_ON_WAIT_S,
+    Exchange,
+    Script,
+    names_of,
+    value_of,
+)
 from drivers.links.link import CanFrame, DeviceError, DeviceRefused, DeviceSilent, FrameLink
 from drivers.roles import HVSample, Identity
 
 T = TypeVar("T")
-
-
-class _Exchange:
-    """A read, with writes that go out before it: each time, or (``once``) only with its first transmission."""
-
-    def __init__(
-        self, item: Item, channel: int | None, writes: tuple[CanFrame, ...] = (), *, once: bool = False
-    ) -> None:
-        self.item = item
-        self.channel = channel
-        self.writes = writes
-        self.once = once
-        self.everyone: set[int] = set()  # channels to be read at once with one request
-
-    def __str__(self) -> str:
-        return self.item.title + ("" if self.channel is None else f" of channel {self.channel}")
-
-
-Script = Generator[Ask[_Exchange], Answer[Message], T]
-
-_ATTEMPTS = 3
-_SURVEY_S = 1.0  # how often the other channels of the module are looked at
-_EMERGENCY_OFTEN, _EMERGENCY_SELDOM_S = 50, 0.1  # ... after so many at this one
-_EMERGENCY_LOOKS = 5
-_EMERGENCY_AGAIN_S = 0.01  # an emergency off that is not confirmed goes out again at this interval
-_SWITCH_ON_LOOKS, _SWITCH_ON_WAIT_S = 5, 0.02
 
 
 class IsegEDCP:
@@ -138,8 +100,8 @@ class IsegEDCP:
             )
         if not 0 < poll_rate_Hz <= 100:
             raise DeviceRefused(where, f"poll rate {poll_rate_Hz} Hz is not possible", "Allowed: above 0, at most 100.")
-        if status_bit_5 not in STATUS_BIT_5:
-            allowed = ", ".join(STATUS_BIT_5)
+        if status_bit_5 not in edcp.STATUS_BIT_5:
+            allowed = ", ".join(edcp.STATUS_BIT_5)
             raise DeviceRefused(where, f"status_bit_5 {status_bit_5!r} is not known", f"Allowed: {allowed}.")
         self.name = name
         self._label = where
@@ -159,14 +121,14 @@ class IsegEDCP:
         self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
         self._max_ramp = max_ramp_percent_per_s
         self._decoder = Decoder(module, self.counters)
-        self._dialogue: Dialogue[_Exchange, Message] = Dialogue(
+        self._dialogue: Dialogue[Exchange, Message] = Dialogue(
             where,
             self._transmit,
             self.counters,
             timeout_s=timeout_s,
             advice=f"Check power, CAN cable and termination, bit rate, and that module {module} is its address.",
         )
-        self._exchange: _Exchange | None = None
+        self._exchange: Exchange | None = None
         self._collected: dict[int, Message] = {}
         self._nominal = (math.nan, math.nan)
         self._channels = 1
@@ -224,7 +186,7 @@ class IsegEDCP:
                 f"a current limit of {amperes:g} A is outside the channel's range",
                 f"Allowed: above 0, at most {self._nominal[1]:g} A.",
             )
-        self._command(self._write_setting(SET_CURRENT, amperes, self._channel, "current_limit_A"))
+        self._command(self._write_setting(edcp.SET_CURRENT, amperes, self._channel, "current_limit_A"))
 
     def set_voltage(self, volts: float) -> None:
         self._require_ready("set the voltage")
@@ -234,7 +196,7 @@ class IsegEDCP:
                 f"a set-point of {volts:g} V is outside the channel's range",
                 f"Allowed: 0 to {self._nominal[0]:g} V.",
             )
-        self._command(self._write_checked(SET_VOLTAGE, self._sign * volts, self._channel))
+        self._command(self._write_checked(edcp.SET_VOLTAGE, self._sign * volts, self._channel))
 
     def switch_on(self) -> None:
         self._require_ready("switch on")
@@ -270,11 +232,11 @@ class IsegEDCP:
         """What the module does after the current has been at its limit for ``delay_s``: see `TRIP_ACTIONS`."""
         if not 0.0 <= delay_s <= 4.095:
             raise DeviceRefused(self._label, f"a trip delay of {delay_s:g} s is not possible", "Allowed: 0 to 4.095 s.")
-        if action not in TRIP_ACTIONS:
-            allowed = ", ".join(f"{code} {text}" for code, text in TRIP_ACTIONS.items())
+        if action not in edcp.TRIP_ACTIONS:
+            allowed = ", ".join(f"{code} {text}" for code, text in edcp.TRIP_ACTIONS.items())
             raise DeviceRefused(self._label, f"trip action {action} does not exist", f"Allowed: {allowed}.")
-        self._command(self._write_setting(TRIP_DELAY, round(delay_s * 1000), self._channel, "trip_delay_ms"))
-        self._command(self._write_setting(TRIP_ACTION, action, self._channel, "trip_action"))
+        self._command(self._write_setting(edcp.TRIP_DELAY, round(delay_s * 1000), self._channel, "trip_delay_ms"))
+        self._command(self._write_setting(edcp.TRIP_ACTION, action, self._channel, "trip_action"))
 
     def set_bounds(self, volts: float, amperes: float) -> None:
         """Deviation of voltage and current from their set-points beyond which the channel reports a bounds error."""
@@ -285,8 +247,8 @@ class IsegEDCP:
                 f"bounds of {volts:g} V and {amperes:g} A are outside the channel's range",
                 f"Allowed: 0 to {self._nominal[0]:g} V and 0 to {self._nominal[1]:g} A.",
             )
-        self._command(self._write_setting(VOLTAGE_BOUNDS, volts, self._channel, "voltage_bounds_V"))
-        self._command(self._write_setting(CURRENT_BOUNDS, amperes, self._channel, "current_bounds_A"))
+        self._command(self._write_setting(edcp.VOLTAGE_BOUNDS, volts, self._channel, "voltage_bounds_V"))
+        self._command(self._write_setting(edcp.CURRENT_BOUNDS, amperes, self._channel, "current_bounds_A"))
 
     # -- polling ----------------------------------------------------------------------------------------------------
 
@@ -321,10 +283,10 @@ class IsegEDCP:
         """Before anything is read: what comes in must not hold it up."""
         if self._emergency_until_confirmed and now >= self._next_emergency:
             self._emergencies += 1
-            often = self._emergencies < _EMERGENCY_OFTEN
-            self._next_emergency = now + (_EMERGENCY_AGAIN_S if often else _EMERGENCY_SELDOM_S)
-            word = self._control & ~OWN_CONTROL | ChannelControl.EMERGENCY_OFF
-            self._link.write(write(self._module, CHANNEL_CONTROL, word, self._channel))
+            often = self._emergencies < EMERGENCY_OFTEN
+            self._next_emergency = now + (EMERGENCY_AGAIN_S if often else EMERGENCY_SELDOM_S)
+            word = self._control & ~edcp.OWN_CONTROL | ChannelControl.EMERGENCY_OFF
+            self._link.write(write(self._module, edcp.CHANNEL_CONTROL, word, self._channel))
 
     def _command(self, script: Script[None]) -> None:
         self._commands += 1
@@ -345,7 +307,7 @@ class IsegEDCP:
         if not self._ready:
             raise DeviceRefused(self._label, f"cannot {what} before the set-up dialogue has ended", "Poll it first.")
 
-    def _transmit(self, exchange: _Exchange) -> Callable[[Message], bool]:
+    def _transmit(self, exchange: Exchange) -> Callable[[Message], bool]:
         for frame in exchange.writes:
             self._link.write(frame)
         if exchange.once:
@@ -378,21 +340,21 @@ class IsegEDCP:
         self, item: Item, writes: tuple[CanFrame, ...] = (), *, once: bool = False, delay_s: float = 0.0
     ) -> Script[Answer[Message]]:
         channel = self._channel if item.per_channel else None
-        return (yield Ask(_Exchange(item, channel, writes, once=once), delay_s=delay_s))
+        return (yield Ask(Exchange(item, channel, writes, once=once), delay_s=delay_s))
 
     def _integer(
         self, item: Item, writes: tuple[CanFrame, ...] = (), *, once: bool = False, delay_s: float = 0.0
     ) -> Script[int]:
-        value = _value((yield from self._read(item, writes, once=once, delay_s=delay_s)))
+        value = value_of((yield from self._read(item, writes, once=once, delay_s=delay_s)))
         assert isinstance(value, int)
         return value
 
     def _number(self, item: Item, limit: float) -> Script[tuple[float, float]]:
         """(value, time) of a float; one that is not finite or beyond ``limit`` is dropped, counted and read again."""
         value = math.nan
-        for _ in range(_ATTEMPTS):
+        for _ in range(ATTEMPTS):
             answer = yield from self._read(item)
-            read = _value(answer)
+            read = value_of(answer)
             assert isinstance(read, float)
             value = read
             if abs(value) <= limit:
@@ -407,23 +369,23 @@ class IsegEDCP:
     def _optional(self, item: Item, *, repeat: bool = False) -> Script[Value | None]:
         """The value of a module item that not every module has: not having it means not answering."""
         try:
-            return _value((yield Ask(_Exchange(item, None), repeat=repeat)))
+            return value_of((yield Ask(Exchange(item, None), repeat=repeat)))
         except DeviceSilent:
             return None
 
     def _set_up(self) -> Script[None]:
         foreign = self.counters["foreign_requests"]
-        yield from self._integer(MODULE_STATUS)
+        yield from self._integer(edcp.MODULE_STATUS)
         if self.counters["foreign_requests"] != foreign:
             raise DeviceRefused(
                 self._label,
                 f"someone else reads from module {self._module}, or the CAN interface returns its own frames",
                 "Writes could not be verified. End the other program, or switch receive_own_messages off.",
             )
-        serial = yield from self._optional(SERIAL_NUMBER, repeat=True)
-        release = yield from self._optional(FIRMWARE_RELEASE)
-        firmware = yield from self._optional(FIRMWARE_NAME)
-        channels = yield from self._optional(CHANNEL_COUNT)
+        serial = yield from self._optional(edcp.SERIAL_NUMBER, repeat=True)
+        release = yield from self._optional(edcp.FIRMWARE_RELEASE)
+        firmware = yield from self._optional(edcp.FIRMWARE_NAME)
+        channels = yield from self._optional(edcp.CHANNEL_COUNT)
         self._channels = channels if isinstance(channels, int) else 1
         if isinstance(channels, int) and not self._channel < channels:
             raise DeviceRefused(
@@ -432,8 +394,8 @@ class IsegEDCP:
                 f"Channels count from 0: allowed is 0 to {channels - 1}.",
             )
         self.identity = identity(serial, release, firmware)
-        volts, _ = yield from self._number(NOMINAL_VOLTAGE, 1e6)
-        amperes, _ = yield from self._number(NOMINAL_CURRENT, 1e3)
+        volts, _ = yield from self._number(edcp.NOMINAL_VOLTAGE, 1e6)
+        amperes, _ = yield from self._number(edcp.NOMINAL_CURRENT, 1e3)
         if not (volts != 0 and amperes != 0):
             raise DeviceRefused(
                 self._label,
@@ -444,9 +406,9 @@ class IsegEDCP:
         volts, amperes = abs(volts), abs(amperes)
         self._nominal = (volts, amperes)
         yield from self._read_settings()
-        setpoint, _ = yield from self._number(SET_VOLTAGE, 2 * volts)
-        status = yield from self._integer(CHANNEL_STATUS)
-        self._control = yield from self._integer(CHANNEL_CONTROL)
+        setpoint, _ = yield from self._number(edcp.SET_VOLTAGE, 2 * volts)
+        status = yield from self._integer(edcp.CHANNEL_STATUS)
+        self._control = yield from self._integer(edcp.CHANNEL_CONTROL)
         self.settings |= {
             "polarity": "positive" if self._sign > 0 else "negative",
             "nominal_voltage_V": f"{volts:.9g}",
@@ -459,9 +421,9 @@ class IsegEDCP:
 
     def _read_settings(self) -> Script[None]:
         volts, amperes = self._nominal
-        limit, _ = yield from self._number(SET_CURRENT, 2 * amperes)
-        ramp, _ = yield from self._number(MODULE_RAMP, 1e3)
-        module = yield from self._integer(MODULE_STATUS)
+        limit, _ = yield from self._number(edcp.SET_CURRENT, 2 * amperes)
+        ramp, _ = yield from self._number(edcp.MODULE_RAMP, 1e3)
+        module = yield from self._integer(edcp.MODULE_STATUS)
         self.settings |= {
             "ramp_percent_per_s": f"{ramp:.9g}",
             "ramp_V_per_s": f"{ramp / 100 * volts:.9g}",
@@ -471,14 +433,14 @@ class IsegEDCP:
 
     def _cycle(self, now: float) -> Script[None]:
         volts, amperes = self._nominal
-        voltage, t = yield from self._number(MEASURED_VOLTAGE, 2 * volts)
-        current, _ = yield from self._number(MEASURED_CURRENT, 10 * amperes)
-        setpoint, _ = yield from self._number(SET_VOLTAGE, 2 * volts)
-        status = yield from self._integer(CHANNEL_STATUS)
+        voltage, t = yield from self._number(edcp.MEASURED_VOLTAGE, 2 * volts)
+        current, _ = yield from self._number(edcp.MEASURED_CURRENT, 10 * amperes)
+        setpoint, _ = yield from self._number(edcp.SET_VOLTAGE, 2 * volts)
+        status = yield from self._integer(edcp.CHANNEL_STATUS)
         if status & ChannelStatus.EMERGENCY_OFF and not status & ChannelStatus.ON:
             self._emergency_until_confirmed = False
-        events = yield from self._integer(CHANNEL_EVENTS)
-        module = yield from self._integer(MODULE_STATUS)
+        events = yield from self._integer(edcp.CHANNEL_EVENTS)
+        module = yield from self._integer(edcp.MODULE_STATUS)
         flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module), self._bit_5)
         if self._sign < 0:  # with which sign a negative channel states them is not settled: magnitudes
             voltage, current, setpoint = abs(voltage), abs(current), abs(setpoint)
@@ -487,11 +449,11 @@ class IsegEDCP:
             self._lost_settings = False
             yield from self._read_settings()
         if self._channels > 1 and now >= self._next_survey:
-            self._next_survey = now + _SURVEY_S
+            self._next_survey = now + SURVEY_S
             yield from self._survey()
 
     def _survey(self) -> Script[None]:
-        exchange = _Exchange(CHANNEL_STATUS, None)
+        exchange = Exchange(edcp.CHANNEL_STATUS, None)
         exchange.everyone = set(range(min(self._channels, 16)))
         yield Ask(exchange)
         for channel, message in self._collected.items():
@@ -503,9 +465,9 @@ class IsegEDCP:
     def _write_checked(self, item: Item, value: float, channel: int | None) -> Script[None]:
         """Write and read back; a write that did not take is repeated, since writes may get lost unnoticed."""
         frame = write(self._module, item, value, channel)
-        for attempt in range(_ATTEMPTS):
+        for attempt in range(ATTEMPTS):
             self.counters["writes_repeated"] += attempt > 0
-            read_back = _value((yield from self._read(item, (frame,))))
+            read_back = value_of((yield from self._read(item, (frame,))))
             if read_back == value or (
                 isinstance(read_back, float) and math.isclose(abs(read_back), abs(value), rel_tol=1e-5)
             ):
@@ -518,17 +480,17 @@ class IsegEDCP:
 
     def _write_control(self, word: ChannelControl) -> Script[None]:
         """Set our own bits of the channel control to ``word`` and leave all others as they are found."""
-        self._control = yield from self._integer(CHANNEL_CONTROL)
-        for attempt in range(_ATTEMPTS):
+        self._control = yield from self._integer(edcp.CHANNEL_CONTROL)
+        for attempt in range(ATTEMPTS):
             self.counters["writes_repeated"] += attempt > 0
-            frame = write(self._module, CHANNEL_CONTROL, self._control & ~OWN_CONTROL | word, self._channel)
-            self._control = yield from self._integer(CHANNEL_CONTROL, (frame,))
-            if self._control & OWN_CONTROL == word:
+            frame = write(self._module, edcp.CHANNEL_CONTROL, self._control & ~edcp.OWN_CONTROL | word, self._channel)
+            self._control = yield from self._integer(edcp.CHANNEL_CONTROL, (frame,))
+            if self._control & edcp.OWN_CONTROL == word:
                 return
         raise DeviceRefused(
             self._label,
             f"channel control reads back as {self._control:04X} after {word:04X} was written to its bits "
-            f"{OWN_CONTROL:04X}",
+            f"{edcp.OWN_CONTROL:04X}",
             "The module does not accept it: check its limits, its state, and who else commands it.",
         )
 
@@ -537,41 +499,41 @@ class IsegEDCP:
         self.settings[key] = f"{value:.9g}"
 
     def _write_ramp(self, percent: float) -> Script[None]:
-        yield from self._write_setting(MODULE_RAMP, percent, None, "ramp_percent_per_s")
+        yield from self._write_setting(edcp.MODULE_RAMP, percent, None, "ramp_percent_per_s")
         self.settings["ramp_V_per_s"] = f"{percent / 100 * self._nominal[0]:.9g}"
         self._wanted_ramp = None
 
     def _write_kill(self, enabled: bool) -> Script[None]:
-        control = ModuleControl((yield from self._integer(MODULE_CONTROL)))
+        control = ModuleControl((yield from self._integer(edcp.MODULE_CONTROL)))
         control = control | ModuleControl.KILL if enabled else control & ~ModuleControl.KILL
-        yield from self._write_checked(MODULE_CONTROL, int(control), None)
+        yield from self._write_checked(edcp.MODULE_CONTROL, int(control), None)
         self.settings["kill_enabled"] = "yes" if enabled else "no"
 
     def _switch_on(self) -> Script[None]:
-        status = ChannelStatus((yield from self._integer(CHANNEL_STATUS)))
-        events = ChannelEvents((yield from self._integer(CHANNEL_EVENTS))) & BLOCKING
+        status = ChannelStatus((yield from self._integer(edcp.CHANNEL_STATUS)))
+        events = ChannelEvents((yield from self._integer(edcp.CHANNEL_EVENTS))) & edcp.BLOCKING
         if events or status & ChannelStatus.EMERGENCY_OFF:
-            causes = _names(events) or "EMERGENCY_OFF"
+            causes = names_of(events) or "EMERGENCY_OFF"
             raise DeviceRefused(
                 self._label, f"is not switched on while {causes} is latched", "Find the cause, then clear."
             )
         if status & ChannelStatus.ON:
             return
         # Written once only: a channel that trips at once must not be switched on again by a repetition.
-        foreign = (yield from self._integer(CHANNEL_CONTROL)) & ~OWN_CONTROL
-        frame = write(self._module, CHANNEL_CONTROL, foreign | ChannelControl.ON, self._channel)
-        control = yield from self._integer(CHANNEL_CONTROL, (frame,), once=True)
-        for _ in range(_SWITCH_ON_LOOKS):
-            status = ChannelStatus((yield from self._integer(CHANNEL_STATUS)))
+        foreign = (yield from self._integer(edcp.CHANNEL_CONTROL)) & ~edcp.OWN_CONTROL
+        frame = write(self._module, edcp.CHANNEL_CONTROL, foreign | ChannelControl.ON, self._channel)
+        control = yield from self._integer(edcp.CHANNEL_CONTROL, (frame,), once=True)
+        for _ in range(SWITCH_ON_LOOKS):
+            status = ChannelStatus((yield from self._integer(edcp.CHANNEL_STATUS)))
             if status & ChannelStatus.ON and control & ChannelControl.ON:
                 return
-            control = yield from self._integer(CHANNEL_CONTROL, delay_s=_SWITCH_ON_WAIT_S)
-        events = ChannelEvents((yield from self._integer(CHANNEL_EVENTS)))
-        module = yield from self._integer(MODULE_EVENTS)
+            control = yield from self._integer(edcp.CHANNEL_CONTROL, delay_s=SWITCH_ON_WAIT_S)
+        events = ChannelEvents((yield from self._integer(edcp.CHANNEL_EVENTS)))
+        module = yield from self._integer(edcp.MODULE_EVENTS)
         raise DeviceRefused(
             self._label,
-            f"did not switch on: control {control:04X}, status {_names(status) or 'off'}, latched events "
-            f"{_names(events) or 'none'}, latched events of the module {module:04X}",
+            f"did not switch on: control {control:04X}, status {names_of(status) or 'off'}, latched events "
+            f"{names_of(events) or 'none'}, latched events of the module {module:04X}",
             "A latched event blocks it until it is cleared. Check safety loop, inhibit input and limits; then clear.",
         )
 
@@ -584,7 +546,7 @@ class IsegEDCP:
             except DeviceError as error:
                 refused = error
         # An emergency off stays latched: only `clear` takes it back.
-        latched = ChannelControl((yield from self._integer(CHANNEL_CONTROL))) & ChannelControl.EMERGENCY_OFF
+        latched = ChannelControl((yield from self._integer(edcp.CHANNEL_CONTROL))) & ChannelControl.EMERGENCY_OFF
         yield from self._write_control(latched)
         if refused is not None:
             raise refused
@@ -593,14 +555,16 @@ class IsegEDCP:
         """Wait for the confirmation of what `_repeat_emergency_off` sends: our own bits only."""
         failure: DeviceError = DeviceRefused(self._label, "the channel's control does not take it")
         try:
-            for attempt in range(_EMERGENCY_LOOKS):
-                self._control = yield from self._integer(CHANNEL_CONTROL, delay_s=_EMERGENCY_AGAIN_S * (attempt > 0))
+            for attempt in range(EMERGENCY_LOOKS):
+                self._control = yield from self._integer(
+                    edcp.CHANNEL_CONTROL, delay_s=EMERGENCY_AGAIN_S * (attempt > 0)
+                )
                 if self._control & ChannelControl.EMERGENCY_OFF:
                     self._emergency_until_confirmed = False
                     return
         except DeviceError as error:
             failure = error
-        self._link.write(EMERGENCY_OFF_ALL)
+        self._link.write(edcp.EMERGENCY_OFF_ALL)
         raise type(failure)(
             self._label,
             f"EMERGENCY OFF IS NOT CONFIRMED ({failure.what}); it was sent to all modules on the bus as well",
@@ -609,27 +573,18 @@ class IsegEDCP:
 
     def _clear(self) -> Script[None]:
         yield from self._write_control(ChannelControl(0))
-        yield from self._acknowledge(MODULE_EVENTS, None)
-        left = ChannelEvents((yield from self._acknowledge(CHANNEL_EVENTS, self._channel))) & BLOCKING
+        yield from self._acknowledge(edcp.MODULE_EVENTS, None)
+        left = ChannelEvents((yield from self._acknowledge(edcp.CHANNEL_EVENTS, self._channel))) & edcp.BLOCKING
         if left:
             raise DeviceRefused(
-                self._label, f"{_names(left)} comes back after it was cleared", "Its cause persists: remove it first."
+                self._label, f"{names_of(left)} comes back after it was cleared", "Its cause persists: remove it first."
             )
 
     def _acknowledge(self, item: Item, channel: int | None) -> Script[int]:
         """Clear the latched bits of an event register by writing them back; returns what is left."""
         events = yield from self._integer(item)
-        for _ in range(_ATTEMPTS):
+        for _ in range(ATTEMPTS):
             if not events:
                 break
             events = yield from self._integer(item, (write(self._module, item, events, channel),))
         return events
-
-
-def _value(answer: Answer[Message]) -> Value:
-    assert isinstance(answer.message, Data)
-    return answer.message.value
-
-
-def _names(flags: IntFlag) -> str:
-    return " ".join(str(flag.name) for flag in flags)

@@ -12,7 +12,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -430,81 +430,48 @@ class IsegEDCP:
 
     def _module_value(self, opcode: int) -> bytes | None:
         s = self._settings
-        match opcode:
-            case 0x1000:
-                return struct.pack(">H", self._module_status())
-            case 0x1001:
-                return struct.pack(">H", (SET_KILL if self._kill else 0) | (SET_FINE if self._fine else 0))
-            case 0x1002:
-                return struct.pack(">H", self._event)
-            case 0x1003:
-                return struct.pack(">H", self._event_mask)
-            case 0x1004:
-                return struct.pack(">H", sum(1 << i for i, c in enumerate(self._channels) if c.event & c.mask))
-            case 0x1005:
-                return struct.pack(">I", 0)
-            case 0x1100:
-                return struct.pack(">f", self._ramp_percent)
-            case 0x1101:
-                return struct.pack(">f", 100.0)
-            case 0x1104:
-                return struct.pack(">f", 24.1)
-            case 0x1105:
-                return struct.pack(">f", 5.02)
-            case 0x1106:
-                return struct.pack(">f", 31.0)
-            case 0x1200:
-                return struct.pack(">I", s.serial_number)
-            case 0x1201:
-                return struct.pack(">I", 0x0005_0012)
-            case 0x1202:
-                return struct.pack(">H", s.bitrate // 1000)
-            case 0x1203:
-                return b"E08C"
-            case 0x1208:
-                return bytes([s.channels])
-            case 0x1280:
-                return struct.pack(">I", 0)
-        return None
+        values: dict[int, tuple[str, Any]] = {
+            0x1000: (">H", self._module_status()),
+            0x1001: (">H", (SET_KILL if self._kill else 0) | (SET_FINE if self._fine else 0)),
+            0x1002: (">H", self._event),
+            0x1003: (">H", self._event_mask),
+            0x1004: (">H", sum(1 << i for i, c in enumerate(self._channels) if c.event & c.mask)),
+            0x1005: (">I", 0),
+            0x1100: (">f", self._ramp_percent),
+            **{code: (">f", at) for code, at in ((0x1101, 100.0), (0x1104, 24.1), (0x1105, 5.02), (0x1106, 31.0))},
+            0x1200: (">I", s.serial_number),
+            0x1201: (">I", 0x0005_0012),
+            0x1202: (">H", s.bitrate // 1000),
+            0x1203: ("4s", b"E08C"),
+            0x1208: ("B", s.channels),
+            0x1280: (">I", 0),
+        }
+        return struct.pack(*values[opcode]) if opcode in values else None
 
     def _channel_value(self, opcode: int, channel: _Channel, t: float) -> bytes | None:
         first = channel is self._channels[0]
-        match opcode:
-            case 0x4000:
-                return struct.pack(">H", self._channel_status(channel))
-            case 0x4001:
-                return struct.pack(">H", channel.control)
-            case 0x4002:
-                return struct.pack(">H", channel.event)
-            case 0x4003:
-                return struct.pack(">H", channel.mask)
-            case 0x4005:
-                return struct.pack(">H", channel.trip_delay_ms)
-            case 0x4006:
-                return bytes([channel.trip_action])
-            case 0x4100:
-                return struct.pack(">f", self._sign * channel.setpoint)
-            case 0x4101:
-                return struct.pack(">f", channel.current_limit)
-            case 0x4102:
-                return struct.pack(">f", self._sign * self._measured_v(t) if first else 0.0)
-            case 0x4103:
-                return struct.pack(">f", self._measured_i(t) if first else 0.0)
-            case 0x4104:
-                return struct.pack(">f", channel.v_bounds)
-            case 0x4105:
-                return struct.pack(">f", channel.i_bounds)
-            case 0x4106:
-                return struct.pack(">f", self._sign * self.nominal_v)
-            case 0x4107:
-                return struct.pack(">f", self.nominal_i)
-            case 0x4123 | 0x4124:
-                return struct.pack(">f", self._rate)
-            case 0x4127:
-                return struct.pack(">f", 0.0)
-            case 0x4128:
-                return struct.pack(">f", self._settings.max_ramp_percent_per_s / 100 * self.nominal_v)
-        return None
+        if opcode == 0x4102:  # a measurement is made when it is asked for
+            return struct.pack(">f", self._sign * self._measured_v(t) if first else 0.0)
+        if opcode == 0x4103:
+            return struct.pack(">f", self._measured_i(t) if first else 0.0)
+        values: dict[int, tuple[str, Any]] = {
+            0x4000: (">H", self._channel_status(channel)),
+            0x4001: (">H", channel.control),
+            0x4002: (">H", channel.event),
+            0x4003: (">H", channel.mask),
+            0x4005: (">H", channel.trip_delay_ms),
+            0x4006: ("B", channel.trip_action),
+            0x4100: (">f", self._sign * channel.setpoint),
+            0x4101: (">f", channel.current_limit),
+            0x4104: (">f", channel.v_bounds),
+            0x4105: (">f", channel.i_bounds),
+            0x4106: (">f", self._sign * self.nominal_v),
+            0x4107: (">f", self.nominal_i),
+            **dict.fromkeys((0x4123, 0x4124), (">f", self._rate)),
+            0x4127: (">f", 0.0),
+            0x4128: (">f", self._settings.max_ramp_percent_per_s / 100 * self.nominal_v),
+        }
+        return struct.pack(*values[opcode]) if opcode in values else None
 
     # Writing
 
