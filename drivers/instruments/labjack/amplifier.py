@@ -237,7 +237,7 @@ class LabJackAmplifier:
         self._dialogue.clear()
         self._commands = 0
         self._emergency = True
-        self._wanted = 0.0
+        self._wanted = self._setpoint = 0.0  # no step down may write more than 0 V after it, confirmed or not
         self._command(self._emergency_off())
         if not self._ready:
             self._dialogue.begin(self._set_up())
@@ -400,7 +400,8 @@ class LabJackAmplifier:
             self._setpoint = self._volts(self._dac_volts)  # somebody was faster: the way down goes on from there
         if self._is_behind(self._measured):
             return
-        elapsed = min(self._now - self._stepped_at, LONGEST_STEP_S)
+        longest = max(LONGEST_STEP_S, 1.01 * self._least_step / self._ramp)  # a slow ramp waits for a whole step
+        elapsed = min(self._now - self._stepped_at, longest)
         change = max(-self._ramp * elapsed, min(self._ramp * elapsed, self._target - self._setpoint))
         if abs(change) < self._least_step and self._setpoint + change != self._target:
             return  # not yet a step's time
@@ -409,7 +410,7 @@ class LabJackAmplifier:
 
     def _check_dac(self, dac: float) -> None:
         """Before the output is raised: the DAC must hold what was written."""
-        if abs(self._volts(dac) - self._setpoint) > self._least_step:
+        if not abs(self._volts(dac) - self._setpoint) <= self._least_step:
             raise DeviceRefused(
                 self._label,
                 f"the DAC holds {dac:.4f} V, not the {self._setpoint / self._amplifier.gain_V_per_V:.4f} V written",
@@ -443,7 +444,7 @@ class LabJackAmplifier:
         wanted = volts / self._amplifier.gain_V_per_V
         yield from self._registers.write(self._dac_register, f32(wanted))
         dac = yield from self._registers.number(self._dac_register)
-        if abs(self._volts(dac) - volts) > self._least_step:
+        if not abs(self._volts(dac) - volts) <= self._least_step:
             raise DeviceRefused(
                 self._label, f"the DAC reads back {dac:.4f} V after {wanted:.4f} V", "The end of its range is reached."
             )
@@ -555,9 +556,9 @@ class LabJackAmplifier:
         yield from self._registers.write(self._dac_register, f32(0.0))
         yield from self._enable(False)
         dac = yield from self._registers.number(self._dac_register)
-        if abs(self._volts(dac)) > max(self._least_step, OFF_V / 4):
+        if not abs(self._volts(dac)) <= max(self._least_step, OFF_V / 4):
             raise DeviceRefused(self._label, f"the DAC stays at {dac:.4f} V", _UNSAFE)
-        self._on = self._proven = False
+        self._on = self._proven = self._found_live = False
         self._setpoint = self._wanted = 0.0
 
     def _emergency_off(self) -> Script:

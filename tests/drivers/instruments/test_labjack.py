@@ -23,7 +23,7 @@ from drivers.instruments.labjack.codec import (
     u16,
     write_request,
 )
-from drivers.links.link import DeviceRefused, DeviceSilent
+from drivers.links.link import DeviceError, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag, HVSample, HVSupply
 from model.material.materials import NAMED
 from model.specimen import Specimen
@@ -310,6 +310,54 @@ def test_an_emergency_off_that_is_not_answered_says_so() -> None:
     with pytest.raises(DeviceSilent, match=r"EMERGENCY OFF IS NOT CONFIRMED.*by hand"):
         rig.run(3.0)
     assert rig.box.dac[0] == 0.0  # and was carried out all the same
+
+
+@pytest.mark.parametrize("kind", ["silent", "line"])
+def test_after_an_emergency_off_that_is_not_confirmed_nothing_but_0_is_written(kind: str) -> None:
+    """The ramp at rest, the output at 800 V: no step of a way down may raise the DAC again."""
+    rig = Rig()
+    rig.up(800.0)
+    written: list[float] = []
+    write = rig.box.write
+
+    def spy(address: int, data: bytes, t: float) -> Any:
+        if address == 1000:
+            written.append(struct.unpack(">f", data)[0])
+        elif kind == "line" and address == 2000:
+            return None  # something else holds the line at "enabled"
+        return write(address, data, t)
+
+    rig.box.write = spy
+    if kind == "silent":
+        rig.bench.inject(Fault(role="hv", kind="silent", at_s=rig.clock.now(), duration_s=1.0))
+    rig.supply.emergency_off()
+    with pytest.raises(DeviceError, match="EMERGENCY OFF IS NOT CONFIRMED"):
+        rig.run(3.0)
+    rig.run(2.0)
+    assert set(written) == {0.0} and rig.output < 60.0
+
+
+def test_an_output_that_reads_back_as_no_number_is_not_called_off() -> None:
+    rig = Rig()
+    rig.up(500.0)
+    read = rig.box.read
+    rig.box.read = lambda address, *rest: f32(math.nan) if address == 1000 else read(address, *rest)
+    rig.supply.emergency_off()
+    with pytest.raises(DeviceRefused, match="the DAC stays at nan"):
+        rig.run(1.0)
+    rig.run(0.2)
+    assert HVFlag.ON in rig.samples[-1].flags
+
+
+def test_a_ramp_slower_than_one_step_of_the_dac_goes_on_all_the_same() -> None:
+    """A T4 has steps of 4.9 V of the output: at 10 V/s one every half second."""
+    rig = Rig({"product": 4}, ramp_V_per_s=10.0)
+    rig.up(100.0)
+    rig.run(12.0)
+    assert rig.output == pytest.approx(100.0, abs=6.0)
+    rig.supply.switch_off()
+    rig.run(13.0)
+    assert rig.output == 0.0 and not rig.supply.busy
 
 
 def test_a_set_point_beyond_the_dac_is_refused_before_it_is_cut_silently() -> None:
