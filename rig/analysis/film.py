@@ -23,8 +23,9 @@ from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
 from rig.base.outputs import write_text
 from rig.base.toml_file import parse_table
-from rig.log.contents import IN_MEMORY, bench_of, bench_word
+from rig.log.contents import IN_MEMORY, bench_of, bench_word, session_in
 from rig.log.dataset import CurveErrors, Run, SpecimenErrors, load_run
+from rig.log.notes import notes_on
 from rig.scene.scene import Scene
 from rig.scene.specimen import SpecimenTable
 from rig.steps import registry
@@ -92,6 +93,11 @@ def identify_logs(
         "benches": benches,
         "outcomes": {str(run.log.path): (run.log.outcome or {}).get("status", "cut off") for run in runs},
     }
+    if sessions := {str(run.log.path): said for run in runs if (said := session_in(run.log))}:
+        provenance["session"] = sessions
+    noted = {str(path): [f"{note.written} {note.by}: {note.text}" for note in notes_on(path)] for path in paths}
+    if any(noted.values()):
+        provenance["notes"] = {path: said for path, said in noted.items() if said}
     if len(set(hashes.values())) < len(paths):
         raise DataError("The same log is given twice; it would count as if it had been measured twice.")
     curves: list[Curve] = []

@@ -9,6 +9,8 @@ from drivers.roles import Identity
 from rig.base.certificates import parse_certificate
 from rig.base.errors import ConfigError
 from rig.base.text import printable
+from rig.base.text_file import decode
+from rig.base.toml_text import parse_toml
 from rig.log.errors import LogError
 from rig.log.reader import Log
 
@@ -38,6 +40,19 @@ def bench_word(bench: str) -> str:
     if is_real(bench):
         return "REAL PORTS"
     return "REPLAY" if bench.startswith(REPLAY_OF) else "SIMULATED"
+
+
+def session_in(log: Log) -> dict[str, str]:
+    """What the scene inside says under ``[session]``: operator, sample, notes, temperature, humidity. As it stands
+    there: the scene may be of another version of this program, or damaged, and then says nothing.
+    """
+    scene = log.attachments.get("scene.toml")
+    try:
+        said = parse_toml(decode(scene.data, "scene.toml", "scene"), "scene", "scene.toml") if scene else {}
+    except ConfigError:
+        return {}
+    session = said.get("session")
+    return {key: str(value) for key, value in session.items()} if isinstance(session, dict) else {}
 
 
 def certificates_in(log: Log) -> dict[str, Certificate]:

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from rig.base.errors import ConfigError
 from rig.base.text import printable
-from rig.log.contents import identities_in
+from rig.log.contents import identities_in, session_in
+from rig.log.notes import notes_on
 from rig.log.reader import Log, read_log
 from rig.log.schema import ROLES
 
@@ -23,8 +25,10 @@ def info(path: Path) -> str:
     log = read_log(path)
     lines = [f"{path}: {_state(log)}", ""]
     lines += _table("run", log.metadata.get("run", {}))
+    lines += _table("session", session_in(log))
     lines += [_row("began", _date(log.start_ns)), _row("lasted", f"{(log.end_ns - log.start_ns) * 1e-9:.3f} s")]
     lines += _table("outcome", log.outcome if log.outcome is not None else {"status": "not recorded"})
+    lines += _notes(path)
     lines += ["", *_devices(log), *_table("unit of", log.metadata.get("units", {}))]
     lines += ["", *_rates(log)]
     if log.attachments:
@@ -43,6 +47,19 @@ def _state(log: Log) -> str:
     if log.ended:
         return f"DAMAGED, {size}; dea-rig recover copies what is sound"
     return f"CUT SHORT, {size}; dea-rig recover makes it whole"
+
+
+def _notes(path: Path) -> list[str]:
+    """What was noted on the log since, the newest last; of a file that cannot be used, why."""
+    try:
+        notes = notes_on(path)
+    except ConfigError as error:
+        return ["", "notes", *(f"  {printable(line)}" for line in str(error).splitlines())]
+    left_out = [f"  ... and {len(notes) - MOST_LINES} before"] if len(notes) > MOST_LINES else []
+    shown = [
+        f"  {printable(note.written)} {printable(note.by)}: {printable(note.text)}" for note in notes[-MOST_LINES:]
+    ]
+    return ["", "notes", *left_out, *shown] if notes else []
 
 
 def _devices(log: Log) -> list[str]:

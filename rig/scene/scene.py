@@ -83,6 +83,32 @@ class BenchTable(Table):
     log: str = Field(min_length=1, description="The log (.mcap), as seen from the scene's folder.")
 
 
+class SessionTable(Table):
+    """Who measured what, and in what air: for logs, reports and the list of runs. Nothing is computed from it."""
+
+    operator: str = Field(default="", max_length=100, description='Who runs the rig. Default: "", not said.')
+    sample: str = Field(
+        default="",
+        max_length=200,
+        description='What a label of the film says beside the name of the specimen. Default: "", nothing.',
+    )
+    notes: str = Field(default="", max_length=4000, description='Anything worth knowing later. Default: "", nothing.')
+    temperature_C: float | None = Field(
+        default=None,
+        ge=-50,
+        le=200,
+        description="Temperature of the air at the film (degrees Celsius), as read. Default: not known. Typical: 18 "
+        "to 30.",
+        json_schema_extra={"usual": [0, 100]},
+    )
+    humidity_percent: float | None = Field(
+        default=None,
+        ge=0,
+        le=100,
+        description="Relative humidity of the air at the film (%), as read. Default: not known. Typical: 20 to 70.",
+    )
+
+
 class Scene(Table):
     """Everything about the bench for one specimen. See the module's docstring."""
 
@@ -94,6 +120,7 @@ class Scene(Table):
     )
     specimen: SpecimenTable = Field(description="The film as mounted.")
     limits: LimitsTable = Field(description="What may never be exceeded.")
+    session: SessionTable | None = Field(default=None, description="Who measures, and in what air. Absent: not said.")
     stage: AnyStage = Field(description="The linear stage that pushes the disk.")
     force: AnyForce = Field(description="The load cell under or over the disk.")
     displacement: AnyDisplacement | None = Field(
