@@ -84,6 +84,14 @@ labjack-displacement  tcp_port                 502   1   65535
 labjack-displacement  ain                      3     0   13
 labjack-displacement  mm_per_V                 needed - -
 labjack-displacement  rate_Hz                  50.0  (0  200
+ascii-stream          timeout_s                0.25  (0  10
+ascii-stream          baud                     115200 (0 -
+ascii-stream          rate_Hz                  80.0  (0  1000
+ascii-stream          columns                  1     1   32
+ascii-stream          column                   1     1   32
+ascii-stream          factor                   1.0   -   -
+ascii-stream          limit                    10000.0 (0 -
+ascii-stream          boot_s                   3.0   0   30
 """
 # What must be said beside.
 NEEDED: dict[str, dict[str, Any]] = {
@@ -120,6 +128,8 @@ def accepts(driver: str, key: str, value: Any) -> bool:
     table = {**usual(driver), key: value}
     if key in ("voltage_ain", "current_ain"):
         table["current_ain" if key == "voltage_ain" else "voltage_ain"] = 5
+    if driver == "ascii-stream" and key == "column":
+        table["columns"] = 32
     if driver == "cia404" and key == "factor":
         table["unit"] = "N"
     try:

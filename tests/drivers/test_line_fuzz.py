@@ -8,6 +8,7 @@ complete is a message or is counted.
 
 from __future__ import annotations
 
+import math
 import random
 import re
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from drivers.instruments import keyence_lkg, shvps
+from drivers.instruments import ascii_stream, keyence_lkg, shvps
 from drivers.instruments.zaber import codec as zaber
 
 BATCH = 100  # lines in one stream, every other one with damage of its own
@@ -119,6 +120,35 @@ def a_number_on_the_wire(value: str, wire: bytes) -> bool:
     return value in numbers or ("nan" in value and bool(special))
 
 
+# -- ASCII stream: the value is the second of three columns
+
+
+def ascii_line(rng: random.Random) -> bytes:
+    value = rng.choice([f"{rng.uniform(-9, 9):.5f}", f"{rng.randrange(-(2**23), 2**23)}", "1.5e-3", "nan", "-inf"])
+    return f"{rng.randrange(10**6)}, {value},ok".encode() + rng.choice([b"\r\n", b"\n"])
+
+
+def ascii_codec() -> ascii_stream.Codec:
+    codec = ascii_stream.Codec(",", 3, 2)
+    assert codec.feed(b"\n") == []  # what comes before the first line end may lack its beginning
+    return codec
+
+
+def ascii_believed(message: ascii_stream.Value) -> list[str]:
+    assert math.isfinite(message.number) or message.flags
+    return [repr(message)]
+
+
+def ascii_on_the_wire(value: str, wire: bytes) -> bool:
+    """Whether a line of three columns has it as its second."""
+    columns = [line.decode("latin-1").split(",") for line in wire.split(b"\n")]
+    words = [c[1].strip().lower() for c in columns if len(c) == 3]
+    if "nan" in value:
+        return bool({"nan", "inf", "+inf", "-inf", "ovf"} & set(words))
+    numbers = [word for word in words if re.fullmatch(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", word) and word.count(".") < 2]
+    return value in {repr(ascii_stream.Value(float(word))) for word in numbers if word not in (".", "+.", "-.")}
+
+
 # -- shvps
 
 
@@ -160,6 +190,18 @@ LANGUAGES = {
         128,
         b"M01TG,ER+-.0123456789FX\r\nSRQ",
         lambda line: bool(line.removeprefix(b"\n")),
+    ),
+    "ascii-stream": Language(
+        ascii_line,
+        ascii_codec,
+        ascii_believed,
+        b"\n",
+        b"\n1,2,3\n",
+        lambda before, after: all(byte in b"+-.,eE \t\r\n0123456789NAFINnafi" for byte in before + after),
+        ascii_on_the_wire,
+        ascii_stream.LONGEST,
+        b"0123456789+-.,eE nanifov\r\n",
+        lambda line: bool(line.removesuffix(b"\r")),
     ),
     "shvps": Language(
         shvps_line,

@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from drivers.instruments.ascii_stream import AsciiForce
 from drivers.instruments.cia404.device import CiA404
 from drivers.instruments.gsv8.device import GSV8
 from drivers.instruments.iseg_edcp.device import IsegEDCP
@@ -58,6 +59,7 @@ DRIVERS: dict[str, Callable[..., Any]] = {
     "gsv8": GSV8,
     "cia404": CiA404,
     "keyence-lkg": KeyenceLKG,
+    "ascii-stream": AsciiForce,
     "iseg-edcp": IsegEDCP,
     "shvps": Shvps,
     "labjack-amplifier": LabJackAmplifier,
@@ -76,6 +78,7 @@ QUIET: dict[str, dict[str, Any]] = {
     "gsv8": {"noise_fraction": 0.0},
     "cia404": {"noise_fraction": 0.0},
     "keyence-lkg": {"noise_um": 0.0},
+    "ascii-stream": {"noise_fraction": 0.0},
     "iseg-edcp": {"voltage_noise_V": 0.0, "current_noise_nA": 0.0},
     "shvps": {"voltage_noise_V": 0.0},
     "labjack-amplifier": {"input_noise_mV": 0.0},
@@ -152,6 +155,18 @@ REQUIRED: dict[tuple[str, str], Required] = {
     ("cia404", "saturate"): Required((("overloads",),), flag=SampleFlag.OVER_RANGE),
     ("cia404", "freeze"): AS_IT_IS,
     ("cia404", "wrong_status"): Required(flag=SampleFlag.NO_VALUE),
+    ("ascii-stream", "delay"): now_and_then(0.05, value=0.05),
+    ("ascii-stream", "drop"): now_and_then(0.05),  # no line has a number
+    ("ascii-stream", "split"): now_and_then(0.5),
+    ("ascii-stream", "merge"): now_and_then(0.2),
+    ("ascii-stream", "duplicate"): now_and_then(0.1),
+    ("ascii-stream", "corrupt"): now_and_then(0.2, ("bad_grammar", "bad_values")),
+    ("ascii-stream", "silent"): Required(error=DeviceSilent, words="no valid", within_s=0.5),
+    ("ascii-stream", "vanish"): LOST,
+    ("ascii-stream", "reset"): Required(error=DeviceSilent, words="no valid", within_s=0.5),
+    ("ascii-stream", "saturate"): Required((("no_value",),), flag=SampleFlag.OVER_RANGE),
+    ("ascii-stream", "freeze"): AS_IT_IS,
+    ("ascii-stream", "wrong_status"): Required((("no_value",),), flag=SampleFlag.NO_VALUE),
     ("keyence-lkg", "delay"): now_and_then(0.05, ("unexpected_replies",), ("retries",), value=0.25),
     ("keyence-lkg", "drop"): now_and_then(0.1, ("retries",)),
     ("keyence-lkg", "split"): now_and_then(0.5),
@@ -231,6 +246,7 @@ BLIND = {
     ("gsv8", "corrupt"): 0.1,
     ("cia404", "corrupt"): 0.15,
     ("keyence-lkg", "corrupt"): 0.15,
+    ("ascii-stream", "corrupt"): 0.15,
     ("iseg-edcp", "corrupt"): 0.35,
     ("shvps", "corrupt"): 0.1,
 }
@@ -239,6 +255,7 @@ PLAUSIBLE = {
     "gsv8": 7.0,
     "cia404": 1e4,
     "keyence-lkg": 80e-3,
+    "ascii-stream": 1e4,
     "iseg-edcp": 12e3,
     "shvps": 6e3,
     "labjack-amplifier": 22e3,

@@ -28,6 +28,7 @@ ROLE_OF = {one.driver: one.role for one in registered().twins.values()}
 LABJACK = ("labjack-amplifier", "labjack-force", "labjack-displacement")
 SCENE_OF = {  # the others are in cone-4mm
     "cia404": "other-instruments",
+    "ascii-stream": "streams",
     "shvps": "other-instruments",
     **dict.fromkeys(LABJACK, "analogue-amplifier"),
 }
@@ -44,6 +45,13 @@ LITTLE: dict[str, dict[str, dict[str, float]]] = {
         "alert": {"value": 0.02},
     },
     "gsv8": {"delay": {"value": 0.02}, "split": {}, "merge": {}, "drop": {"probability": 0.05}},
+    "ascii-stream": {
+        "delay": {"value": 0.02},
+        "split": {},
+        "merge": {"probability": 0.05},
+        "duplicate": {"probability": 0.05},
+        "drop": {"probability": 0.05},
+    },
     "cia404": {"delay": {"value": 0.02}, "drop": {"probability": 0.05}, "alert": {"value": 0.3}},
     "keyence-lkg": {
         "delay": {"value": 0.02},
@@ -79,6 +87,7 @@ LITTLE: dict[str, dict[str, dict[str, float]]] = {
 COUNTED = {
     "zaber": ("retries", "unexpected_replies", "alerts"),
     "gsv8": ("lost_samples", "gaps"),
+    "ascii-stream": (),  # its lines have no number
     "cia404": ("lost_samples", "gaps", "emergencies"),
     "keyence-lkg": ("retries", "unexpected_replies", "pushed"),
     "iseg-edcp": ("retries", "unexpected_frames", "log_ons"),
@@ -97,6 +106,10 @@ ENDS: dict[tuple[str, str], str] = {
             for cell in ("gsv8", "cia404")
             for kind in ("drop", "duplicate", "silent", "vanish", "reset", "saturate", "freeze", "wrong_status")
         ],
+        OFF,
+    ),
+    **dict.fromkeys(
+        [("ascii-stream", kind) for kind in ("silent", "vanish", "reset", "saturate", "freeze", "wrong_status")],
         OFF,
     ),
     **dict.fromkeys(
@@ -135,13 +148,15 @@ ENDS: dict[tuple[str, str], str] = {
     ),
     # No checksum, or none that the switch leaves wrong: one message in twenty has a bit turned over.
     **dict.fromkeys(
-        [(driver, "corrupt") for driver in ("gsv8", "cia404", "keyence-lkg", "iseg-edcp", "shvps")], EITHER
+        [(driver, "corrupt") for driver in ("gsv8", "cia404", "ascii-stream", "keyence-lkg", "iseg-edcp", "shvps")],
+        EITHER,
     ),
 }
 SEEN_DAMAGE = {
     "gsv8": ("bad_frames", "dropped_bytes", "bad_values"),
     "cia404": ("bad_values", "overloads", "ignored_frames", "bad_frames"),
     "keyence-lkg": ("bad_grammar", "retries"),
+    "ascii-stream": ("bad_grammar", "bad_values"),
     "iseg-edcp": ("bad_frames", "bad_values", "unexpected_frames", "retries"),
     "shvps": ("bad_grammar", "retries", "doubted", "implausible"),
 }

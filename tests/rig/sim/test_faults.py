@@ -367,6 +367,7 @@ PROBE = {
     "iseg-edcp": "201#1208",
     "cia404": "605#4000100000000000",
     "gsv8": b"",
+    "ascii-stream": b"",
     **dict.fromkeys(
         ("labjack-amplifier", "labjack-force", "labjack-displacement"), bytes.fromhex("000100000006010300000002")
     ),
