@@ -26,6 +26,7 @@ from rig.base.toml_file import parse_table
 from rig.log.contents import IN_MEMORY, bench_of, bench_word, session_in
 from rig.log.dataset import CurveErrors, Run, SpecimenErrors, load_run
 from rig.log.notes import notes_on
+from rig.log.reader import Log
 from rig.scene.scene import Scene
 from rig.scene.specimen import SpecimenTable
 from rig.steps import registry
@@ -93,11 +94,7 @@ def identify_logs(
         "benches": benches,
         "outcomes": {str(run.log.path): (run.log.outcome or {}).get("status", "cut off") for run in runs},
     }
-    if sessions := {str(run.log.path): said for run in runs if (said := session_in(run.log))}:
-        provenance["session"] = sessions
-    noted = {str(path): [f"{note.written} {note.by}: {note.text}" for note in notes_on(path)] for path in paths}
-    if any(noted.values()):
-        provenance["notes"] = {path: said for path, said in noted.items() if said}
+    provenance |= said_in([run.log for run in runs])
     if len(set(hashes.values())) < len(paths):
         raise DataError("The same log is given twice; it would count as if it had been measured twice.")
     curves: list[Curve] = []
@@ -277,6 +274,23 @@ def _certificate_problems(run: Run) -> list[str]:
         if message.fields["severity"] == "warning" and " certificate " in text and text not in problems:
             problems.append(text)
     return problems
+
+
+def said_in(logs: Sequence[Log]) -> dict[str, dict[str, object]]:
+    """What people said of ``logs``, by path: ``session`` of their scenes and ``notes`` beside them, if there are any.
+
+    Raises
+    ------
+    ConfigError
+        When the notes of a log cannot be read.
+    """
+    found: dict[str, dict[str, object]] = {"session": {}, "notes": {}}
+    for log in logs:
+        notes = [f"{note.written} {note.by}: {note.text}" for note in notes_on(log.path)]
+        for kind, said in (("session", session_in(log)), ("notes", notes)):
+            if said:
+                found[kind][str(log.path)] = said
+    return {kind: said for kind, said in found.items() if said}
 
 
 def write_results(found: Found, fit: Path | None, report: Path | None) -> None:

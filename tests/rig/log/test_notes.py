@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from calibration.report.sections.provenance import flat
+from rig.analysis.film import said_in
 from rig.base.errors import ConfigError, RigError
 from rig.cli.app import main
 from rig.log.info import info
 from rig.log.notes import LONGEST, MOST, add_note, notes_file, notes_on
+from rig.log.reader import read_log
 from rig.log.writer import LogWriter
 
 AWKWARD = "She said \"no\" \\ C:\\temp, 100 % — naïve 测试 😀\n[[note]]\ntext = 'x'"
@@ -102,3 +105,17 @@ def test_operator_sample_and_air_of_the_scene_are_shown(tmp_path: Path) -> None:
         ["session.humidity_percent", "41"],
     ):
         assert row in rows
+
+
+def test_reports_name_session_and_notes_of_the_logs_that_have_any(small: Path, tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "a.mcap") as log:
+        log.attach("scene.toml", "application/toml", b'[session]\noperator = "M. Curie"\n')
+        log.finish({"status": "complete"})
+    logs = [read_log(small), read_log(tmp_path / "a.mcap")]
+    assert said_in(logs) == {"session": {str(logs[1].path): {"operator": "M. Curie"}}}
+    add_note(small, "A scratch.", "Noether")
+    said = said_in(logs)
+    assert list(said) == ["session", "notes"] and list(said["notes"]) == [str(small)]
+    shown = dict(flat(said))
+    assert shown[f"session › {logs[1].path} › operator"] == "M. Curie"
+    assert shown[f"notes › {small}"].endswith("Noether: A scratch.")
