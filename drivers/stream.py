@@ -1,19 +1,22 @@
-"""A force sensor that streams by itself at a fixed rate: its samples get their times, its silence is told."""
+"""A sensor that streams by itself at a fixed rate: its samples get their times, its silence is told."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Generic, TypeVar
 
 from drivers.links.link import DeviceRefused, DeviceSilent
-from drivers.roles import ForceSample
+from drivers.roles import DisplacementSample, ForceSample
 from drivers.sample_clock import SampleClock
+
+S = TypeVar("S", ForceSample, DisplacementSample)
 
 _GOLDEN = 0.6180339887498949
 
 
-class Stream:
+class Stream(Generic[S]):
     """The stream of one sensor, from its start on.
 
     Parameters
@@ -37,7 +40,7 @@ class Stream:
         self._rate = rate_Hz
         self._patience = max(timeout_s, 5.0 / rate_Hz)
         self._interval = poll_interval_s
-        self._clock: SampleClock[ForceSample | None] = SampleClock(rate_Hz, counters)
+        self._clock: SampleClock[S | None] = SampleClock(rate_Hz, counters)
         self._heard = math.inf  # the first poll sets it
         self._polls = 0
 
@@ -50,7 +53,7 @@ class Stream:
             spread *= 0.2  # finds the phase of the stream sooner
         return now + self._interval * spread
 
-    def take(self, now: float, arrived: Sequence[ForceSample | None]) -> list[ForceSample]:
+    def take(self, now: float, arrived: Sequence[S | None]) -> list[S]:
         """What had arrived by ``now``, oldest first, None for one that is not valid: those whose times are settled.
 
         Raises

@@ -92,6 +92,11 @@ ascii-stream          column                   1     1   32
 ascii-stream          factor                   1.0   -   -
 ascii-stream          limit                    10000.0 (0 -
 ascii-stream          boot_s                   3.0   0   30
+optoncdt-1420         timeout_s                0.25  (0  10
+optoncdt-1420         baud                     921600 (0 -
+optoncdt-1420         measuring_range_mm       50.0  (0  -
+optoncdt-1420         rate_Hz                  250.0 (0  4000
+optoncdt-1420         first_error_word         262073 65521 262143
 """
 # What must be said beside.
 NEEDED: dict[str, dict[str, Any]] = {

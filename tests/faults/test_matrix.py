@@ -27,6 +27,7 @@ from drivers.instruments.keyence_lkg import KeyenceLKG
 from drivers.instruments.labjack import PRESETS
 from drivers.instruments.labjack.amplifier import LabJackAmplifier
 from drivers.instruments.labjack.analog_input import AnalogDisplacement, AnalogForce
+from drivers.instruments.optoncdt import OptoNCDT
 from drivers.instruments.shvps import Shvps
 from drivers.instruments.zaber.device import ZaberStage
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
@@ -60,6 +61,7 @@ DRIVERS: dict[str, Callable[..., Any]] = {
     "cia404": CiA404,
     "keyence-lkg": KeyenceLKG,
     "ascii-stream": AsciiForce,
+    "optoncdt-1420": OptoNCDT,
     "iseg-edcp": IsegEDCP,
     "shvps": Shvps,
     "labjack-amplifier": LabJackAmplifier,
@@ -79,6 +81,7 @@ QUIET: dict[str, dict[str, Any]] = {
     "cia404": {"noise_fraction": 0.0},
     "keyence-lkg": {"noise_um": 0.0},
     "ascii-stream": {"noise_fraction": 0.0},
+    "optoncdt-1420": {"noise_um": 0.0},
     "iseg-edcp": {"voltage_noise_V": 0.0, "current_noise_nA": 0.0},
     "shvps": {"voltage_noise_V": 0.0},
     "labjack-amplifier": {"input_noise_mV": 0.0},
@@ -155,6 +158,19 @@ REQUIRED: dict[tuple[str, str], Required] = {
     ("cia404", "saturate"): Required((("overloads",),), flag=SampleFlag.OVER_RANGE),
     ("cia404", "freeze"): AS_IT_IS,
     ("cia404", "wrong_status"): Required(flag=SampleFlag.NO_VALUE),
+    ("optoncdt-1420", "delay"): now_and_then(0.05, value=0.05),
+    ("optoncdt-1420", "drop"): now_and_then(0.05, ("lost_samples",), ("gaps",)),
+    ("optoncdt-1420", "split"): now_and_then(0.5),
+    ("optoncdt-1420", "merge"): now_and_then(0.2),
+    ("optoncdt-1420", "duplicate"): now_and_then(0.1, ("time_resyncs",)),
+    ("optoncdt-1420", "corrupt"): now_and_then(0.2, ("dropped_bytes",)),
+    ("optoncdt-1420", "silent"): STREAM_SILENT,
+    ("optoncdt-1420", "vanish"): LOST,
+    ("optoncdt-1420", "reset"): Required(error=DeviceSilent, words="no valid", within_s=0.5),
+    ("optoncdt-1420", "saturate"): Required(flag=SampleFlag.OVER_RANGE),
+    ("optoncdt-1420", "freeze"): AS_IT_IS,
+    ("optoncdt-1420", "wrong_status"): Required((("error_words",),), flag=SampleFlag.NO_VALUE),
+    ("optoncdt-1420", "no_value"): Required((("error_words",),), flag=SampleFlag.NO_VALUE),
     ("ascii-stream", "delay"): now_and_then(0.05, value=0.05),
     ("ascii-stream", "drop"): now_and_then(0.05),  # no line has a number
     ("ascii-stream", "split"): now_and_then(0.5),
@@ -247,6 +263,7 @@ BLIND = {
     ("cia404", "corrupt"): 0.15,
     ("keyence-lkg", "corrupt"): 0.15,
     ("ascii-stream", "corrupt"): 0.15,
+    ("optoncdt-1420", "corrupt"): 0.2,
     ("iseg-edcp", "corrupt"): 0.35,
     ("shvps", "corrupt"): 0.1,
 }
@@ -256,6 +273,7 @@ PLAUSIBLE = {
     "cia404": 1e4,
     "keyence-lkg": 80e-3,
     "ascii-stream": 1e4,
+    "optoncdt-1420": 51e-3,
     "iseg-edcp": 12e3,
     "shvps": 6e3,
     "labjack-amplifier": 22e3,

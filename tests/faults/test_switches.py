@@ -29,6 +29,7 @@ LABJACK = ("labjack-amplifier", "labjack-force", "labjack-displacement")
 SCENE_OF = {  # the others are in cone-4mm
     "cia404": "other-instruments",
     "ascii-stream": "streams",
+    "optoncdt-1420": "streams",
     "shvps": "other-instruments",
     **dict.fromkeys(LABJACK, "analogue-amplifier"),
 }
@@ -45,6 +46,7 @@ LITTLE: dict[str, dict[str, dict[str, float]]] = {
         "alert": {"value": 0.02},
     },
     "gsv8": {"delay": {"value": 0.02}, "split": {}, "merge": {}, "drop": {"probability": 0.05}},
+    "optoncdt-1420": {"delay": {"value": 0.02}, "split": {}, "merge": {}, "drop": {"probability": 0.05}},
     "ascii-stream": {
         "delay": {"value": 0.02},
         "split": {},
@@ -87,6 +89,7 @@ LITTLE: dict[str, dict[str, dict[str, float]]] = {
 COUNTED = {
     "zaber": ("retries", "unexpected_replies", "alerts"),
     "gsv8": ("lost_samples", "gaps"),
+    "optoncdt-1420": ("lost_samples", "gaps"),
     "ascii-stream": (),  # its lines have no number
     "cia404": ("lost_samples", "gaps", "emergencies"),
     "keyence-lkg": ("retries", "unexpected_replies", "pushed"),
@@ -110,6 +113,13 @@ ENDS: dict[tuple[str, str], str] = {
     ),
     **dict.fromkeys(
         [("ascii-stream", kind) for kind in ("silent", "vanish", "reset", "saturate", "freeze", "wrong_status")],
+        OFF,
+    ),
+    **dict.fromkeys(
+        [
+            ("optoncdt-1420", kind)
+            for kind in ("duplicate", "silent", "vanish", "reset", "saturate", "freeze", "wrong_status", "no_value")
+        ],
         OFF,
     ),
     **dict.fromkeys(
@@ -148,7 +158,10 @@ ENDS: dict[tuple[str, str], str] = {
     ),
     # No checksum, or none that the switch leaves wrong: one message in twenty has a bit turned over.
     **dict.fromkeys(
-        [(driver, "corrupt") for driver in ("gsv8", "cia404", "ascii-stream", "keyence-lkg", "iseg-edcp", "shvps")],
+        [
+            (driver, "corrupt")
+            for driver in ("gsv8", "cia404", "ascii-stream", "optoncdt-1420", "keyence-lkg", "iseg-edcp", "shvps")
+        ],
         EITHER,
     ),
 }
@@ -157,6 +170,7 @@ SEEN_DAMAGE = {
     "cia404": ("bad_values", "overloads", "ignored_frames", "bad_frames"),
     "keyence-lkg": ("bad_grammar", "retries"),
     "ascii-stream": ("bad_grammar", "bad_values"),
+    "optoncdt-1420": ("dropped_bytes", "bad_values", "error_words"),
     "iseg-edcp": ("bad_frames", "bad_values", "unexpected_frames", "retries"),
     "shvps": ("bad_grammar", "retries", "doubted", "implausible"),
 }

@@ -146,7 +146,7 @@ class CiA404:
             advice=f"Check power, CAN cable and termination, bit rate, and that the device is node {node}.",
         )
         self._layout = Layout((), channel)
-        self._stream: Stream | None = None
+        self._stream: Stream[ForceSample] | None = None
         self._emergency = 0
         self._inbox: deque[CanFrame] = deque()
         self._next_poll = -math.inf

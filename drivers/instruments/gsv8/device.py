@@ -143,7 +143,7 @@ class GSV8:
         self._gain = math.nan
         self._offset = 0.0
         self._limit = _UNKNOWN_RANGE_LIMIT
-        self._stream: Stream | None = None
+        self._stream: Stream[ForceSample] | None = None
         self._fresh = True
         self._inbox: deque[Message] = deque()
         self._next_poll = -math.inf

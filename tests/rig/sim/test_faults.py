@@ -368,6 +368,7 @@ PROBE = {
     "cia404": "605#4000100000000000",
     "gsv8": b"",
     "ascii-stream": b"",
+    "optoncdt-1420": b"",
     **dict.fromkeys(
         ("labjack-amplifier", "labjack-force", "labjack-displacement"), bytes.fromhex("000100000006010300000002")
     ),
