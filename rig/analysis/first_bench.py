@@ -22,7 +22,7 @@ from rig.base.errors import ConfigError
 from rig.base.law_tables import law_table
 from rig.base.toml_file import validate
 from rig.scene.presets import Preset
-from rig.scene.scene import LimitsTable, Scene
+from rig.scene.scene import LimitsTable, Scene, SessionTable
 from rig.scene.specimen import MaterialTable, SpecimenTable
 from rig.sim.settings import SimulationSettings
 from rig.sim.twins import of_role
@@ -143,6 +143,7 @@ def scene_text(film: Film, reach: Extent, *, hv: bool, displacement: bool) -> st
         f"# {film.preset.title}, on the simulated bench. `dea-rig devices` tells the ports of a real one.",
         "",
         commented("", Scene, {"title": f"{film.preset.title}, disk {film.disk_radius_mm:g} mm"}),
+        commented("[session]", SessionTable, {}),
         commented("[specimen]", SpecimenTable, film.keys()),
         commented("[specimen.material]", law, film.material()),
         commented("[limits]", LimitsTable, limits),

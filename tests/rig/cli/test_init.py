@@ -40,6 +40,7 @@ def test_check_accepts_what_it_wrote(tmp_path: Path, preset: str) -> None:
     for number, line in enumerate(lines):
         if " = " in line and not line.startswith("#"):
             assert lines[number - 1].startswith("# "), line
+    assert tomllib.loads(text)["session"] == {} and "# operator = ..." in lines  # to be filled in
     assert (folder / "schema" / "scene.json").is_file() and lines[0] == "#:schema schema/scene.json"
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
