@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ from rig.operator.control import Control
 from rig.operator.status import Status
 from rig.safety import heartbeat
 from rig.safety.arming import Arming
-from rig.safety.guard import AnyGuard, Guard
+from rig.safety.guard import SAFE_VOLTAGE, AnyGuard, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limit, Limits
 from rig.steps.base import Action, Turns, write_phase
 from rig.steps.output import choose_about_live_output, confirm_voltage
@@ -149,6 +149,8 @@ class Engine:
             status, error = "limit", caught
         except Exception as caught:  # a mistake of ours must end as safely as a fault of the rig
             status, error = "fault", caught
+        except BaseException as caught:  # a step or driver of another package that calls sys.exit, for one
+            status, error = "fault", FaultError(f"internal error: {caught!r}")
         if error is not None:
             known = isinstance(error, RigError | DeviceError)
             reason = str(error) if known else f"internal error: {error!r}"
@@ -167,7 +169,8 @@ class Engine:
         if snapshot:
             self.recorder.snapshot(reason, ended, SNAPSHOT_S, SNAPSHOT_S)
         for role, device in self.bench.devices.items():
-            self.recorder.counters(role, device.counters)
+            with suppress(Exception):  # what a driver miscounts must not hide how the run ended
+                self.recorder.counters(role, device.counters)
         if error is not None:
             self.recorder.event("error", "engine", reason)
         return self._outcome(status, reason, rest), error
@@ -302,9 +305,22 @@ class Engine:
             for _ in turns:
                 self._show_now_and_then(done + min(self.clock.now() - began, action.duration), total, label)
                 self._turn()
+                self._keep_hands_safe(action)
                 if self.control.pausing:
                     return False
         return True
+
+    def _keep_hands_safe(self, action: Action) -> None:
+        """A step whose hands come near the rig asks for them only when the output is latched and measured off."""
+        guard = self.guard
+        if guard is None or not action.by.hands or self.control.question is None:
+            return
+        off = guard.last is not None and abs(guard.last.voltage) < SAFE_VOLTAGE
+        if not (guard.state is GuardState.SAFE and off):
+            raise FaultError(
+                f"Step {action.step} ({action.kind}) asks for the operator's hands though the high voltage is not "
+                "latched and measured off: its carry_out must take it down first."
+            )
 
     def _pause(self, action: Action, done: float, total: float) -> None:
         """Stage standing, voltage down; once the operator continues, back to where the action begins."""
@@ -385,7 +401,7 @@ class Engine:
 
     def _next_turn(self, now: float) -> float:
         wanted = min(device.next_poll for device in self.bench.devices.values())
-        return min(max(wanted, now + SHORTEST_TURN_S), now + LONGEST_TURN_S)
+        return min(max(now + SHORTEST_TURN_S, wanted), now + LONGEST_TURN_S)  # in this order NaN is no time
 
     def _take(self, role: str, sample: Sample, now: float) -> None:
         sample = self.recorder.add(sample)

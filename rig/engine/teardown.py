@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,6 +18,7 @@ from rig.log.recorder import Recorder
 from rig.operator.control import Control
 from rig.safety.guard import ADVICE, AT_ONCE_S, NOT_SAFE, AnyGuard, ramp_limit
 
+SHORTEST_S = 0.001  # of a turn
 AGAIN_S = 0.1  # a command that failed is given again at this interval
 LISTEN_S = 2.0  # for a supply that was never commanded: how long to wait for measurements of it
 
@@ -82,7 +84,7 @@ class Teardown:
             if given_up or (heard and self._safe() and self._standing()):
                 break
             self._recorder.tick(now)
-            clock.sleep_until(next_turn(now))
+            clock.sleep_until(self._due(next_turn, now))
         rest = Rest(self._safe(), self._standing())
         if not rest.safe:
             self._recorder.event("error", "hv", f"{NOT_SAFE} {ADVICE}")
@@ -116,7 +118,7 @@ class Teardown:
         """
         try:
             act()
-        except Exception as error:
+        except BaseException as error:
             self._failed.add(role)
             text = str(error) or repr(error)
             if text not in self._told:
@@ -127,10 +129,18 @@ class Teardown:
             self._failed.discard(role)
         return True
 
+    def _due(self, next_turn: Callable[[float], float], now: float) -> float:
+        due = now
+        with suppress(Exception):  # of a driver that cannot say when
+            due = next_turn(now)
+        return max(now + SHORTEST_S, due)
+
     def _safe(self) -> bool:
         if self._guard is None:
             return self._bench.scene.hv is None
         return self._guard.output_is_safe and "hv" not in self._failed
 
     def _standing(self) -> bool:
-        return "stage" in self._bench.devices and "stage" not in self._failed and not self._bench.stage.moving
+        with suppress(Exception):  # of a driver that cannot say whether
+            return "stage" in self._bench.devices and "stage" not in self._failed and not self._bench.stage.moving
+        return False

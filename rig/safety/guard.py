@@ -293,7 +293,8 @@ class Guard:
         if self.state is not GuardState.SAFE:
             self._judge_engine(now)
         h = self._beat.displacement if self._beat is not None else math.nan
-        live = self.commanded and not self.output_is_safe
+        cut = self.state is GuardState.SAFE and not self.ramps_down  # an off that is given again and again is not heard
+        live = self.commanded and not self.output_is_safe and not cut
         if live and now >= self._next_film_check and math.isfinite(h):  # else the sensor's own judgement decides
             self._next_film_check = now + FILM_CHECK_S
             try:

@@ -156,7 +156,7 @@ class Server:
         while not self._channel.closed and not self._dismissed:
             try:
                 self._turn()
-            except Exception as error:  # whatever it is, the output goes off first
+            except BaseException as error:  # whatever it is, the output goes off first
                 self._fault(error)
             self._wait()
         guard = self._guard
@@ -228,7 +228,7 @@ class Server:
             self._channel.flush()
             select.select([self._channel], [], [], wait)
 
-    def _fault(self, error: Exception) -> None:
+    def _fault(self, error: BaseException) -> None:
         guard = self._guard
         if guard is not None and guard.state is not GuardState.SAFE:
             self._off(guard, str(error) or repr(error))
@@ -247,7 +247,7 @@ class Server:
             guard.kill(cause)
             if self._supply is not None:
                 self._poll(guard, self._supply)
-        except Exception as error:
+        except BaseException as error:
             self._channel.send({"is": "error", "error": pack_error(error)})
 
     def _insist(self, guard: Guard, now: float) -> None:
@@ -403,7 +403,7 @@ class Server:
                 assert self._supply is not None
                 self._poll(guard, self._supply)
                 self._insist(guard, self._clock.now())
-            except Exception as error:
+            except BaseException as error:
                 self._fault(error)
             self._wait()
         measured = guard.last.voltage if guard.last is not None else float("nan")
@@ -456,10 +456,11 @@ class LastWords:
         return not self._unsaid
 
 
-def pack_error(error: Exception) -> Message:
+def pack_error(error: BaseException) -> Message:
     """An error as plain text and numbers."""
     if isinstance(error, DeviceError):
-        return {"kind": type(error).__name__, "device": error.device, "what": error.what, "advice": error.advice}
+        said = {"device": error.device, "what": error.what, "advice": error.advice}
+        return {"kind": type(error).__name__, **{key: str(text) for key, text in said.items()}}
     if not isinstance(error, RigError):
         error = FaultError(f"hv: internal error of the guard: {error!r}", device=ROLE)
     return error.fields()

@@ -114,8 +114,9 @@ class Rig:
         """
         if self.guard is None:
             raise FaultError(f"{volts:g} V asked for, but the scene has no HV.")
-        if self.guard.state is GuardState.SAFE:
+        if volts != 0.0 or self.guard.state is GuardState.SAFE:  # never above what the operator typed; to 0 V always
             self.arming.check(volts)
+        if self.guard.state is GuardState.SAFE:
             self.recorder.operator("arms", self.arming.confirmed, self.arming.requested)
             self.event("hv", f"armed by two acts: {self.arming.requested}; {self.arming.confirmed}")
             self.guard.arm()

@@ -12,6 +12,7 @@ import pytest
 from drivers.roles import HVFlag, HVSample
 from rig.base.errors import FaultError, LimitError
 from rig.safety.guard import Guard, GuardState
+from rig.safety.heartbeat import Heartbeat
 from rig.safety.limits import FilmLimits, Limits
 from rig.scene.scene import load_scene
 
@@ -354,3 +355,14 @@ def test_a_ramp_down_that_does_not_come_down_is_not_waited_for(start: float) -> 
             end = 0.1 * number
             guard.on_sample(at(end, start - number % 5, RAMPING, setpoint=0.0))
     assert end < 3.0  # one that was on its way up may go on until the command has arrived
+
+
+def test_a_film_beyond_its_limits_is_cut_off_once_not_at_every_look() -> None:
+    """An emergency off overtakes the supply's measuring: given every 50 ms it would never be measured."""
+    guard, supply, _ = live()
+    guard.heartbeat(Heartbeat(1, 0.0, 60e-3, {}).encode(), 0.0)
+    with pytest.raises(LimitError):
+        guard.turn(0.01)
+    for k in range(20):
+        guard.turn(0.1 + 0.1 * k)
+    assert supply.words.count("emergency_off") == 1
