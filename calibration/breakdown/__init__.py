@@ -1,0 +1,1 @@
+"""Statistics of breakdown: Weibull distributions of voltages or fields, with specimens that did not fail."""
