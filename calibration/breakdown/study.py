@@ -108,7 +108,7 @@ def _of_area(area: AreaScaling | None) -> list[str]:
         return []
     if area.p_weakest_link < SIGNIFICANT:
         return [
-            f"The areas do not act as the weakest link says (p = {area.p_weakest_link:.3f}): do not scale to other areas."
+            f"Area does not act as the weakest link says (p = {area.p_weakest_link:.3f}): do not scale to other areas."
         ]
     if area.p_no_influence >= SIGNIFICANT:
         return ["The areas tested do not show whether area matters; scaling to other areas is an assumption."]
