@@ -221,7 +221,7 @@ def full_after(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(part_file.os, "write", write)
 
 
-@pytest.mark.parametrize("limit", [7_000, 7_001, 9_777, 20_000])
+@pytest.mark.parametrize("limit", [9_500, 9_501, 11_777, 20_000])
 def test_a_full_disk_ends_the_log_for_good(tmp_path, monkeypatch, limit):
     path = tmp_path / "a.mcap"
     full_after(limit, monkeypatch)
