@@ -139,7 +139,7 @@ def test_the_output_goes_off_without_any_of_our_processes(running: Running, sent
     assert running.bench.do(lambda bench: bench.instruments["hv"].box.watchdog_acted) >= 1  # type: ignore[attr-defined]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 def test_fifty_times(tmp_path: Path, sent: int) -> None:

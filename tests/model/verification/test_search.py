@@ -22,7 +22,8 @@ def test_fifty_states_around_loss_of_convexity() -> None:
 
 @pytest.mark.slow
 def test_few_states_around_loss_of_convexity_disagree() -> None:
-    """The whole search is a command (``python -m model.verification.search --states 20000 --truth 500``): it takes a day.
+    """The whole search is a command that takes a day:
+    ``python -m model.verification.search --states 20000 --truth 500``.
 
     Known today: 4 of 750 states differ, two in a status NOT_CONVERGED, two in forces by 1.3 and 2 stated errors. None
     disagrees with the finite elements, which is what must never happen.
