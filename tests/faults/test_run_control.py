@@ -121,7 +121,7 @@ def test_nothing_is_armed_before_the_highest_voltage_has_been_typed(tell: Tell) 
     typed: list[str] = []
 
     def script(control: Control) -> list[str]:
-        wrong = ["yes", "100", "1000 V", "", "continue"]
+        wrong = ["yes", "100", "1000 mV", "", "continue"]
         if control.question is None or control.answer is not None or len(typed) > len(wrong):
             return []
         typed.append([*wrong, "1000"][len(typed)])

@@ -360,6 +360,7 @@ def test_a_ramp_down_that_does_not_come_down_is_not_waited_for(start: float) -> 
 def test_a_film_beyond_its_limits_is_cut_off_once_not_at_every_look() -> None:
     """An emergency off overtakes the supply's measuring: given every 50 ms it would never be measured."""
     guard, supply, _ = live()
+    guard.on_sample(sample(1000.0, HVFlag.ON))
     guard.heartbeat(Heartbeat(1, 0.0, 60e-3, {}).encode(), 0.0)
     with pytest.raises(LimitError):
         guard.turn(0.01)
