@@ -16,6 +16,7 @@ from model.specimen import Specimen
 from model.stability.branches import pull_in
 
 ROUNDS = 60
+NEXT_TO_SLACK = 1e-4  # of the slack voltage
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,8 @@ def pull_in_voltage(
     voltage, with the status SLACK where it loses all tension first.
     """
     displacement = np.asarray(h, dtype=float)
-    low, high = np.zeros(displacement.shape), slack_voltage(specimen, displacement) * (1.0 - 1e-9)
+    slack = slack_voltage(specimen, displacement)
+    low, high = np.zeros(displacement.shape), slack * (1.0 - 1e-9)
     top = solve_many(specimen, displacement, high, tolerance=1e-6, wrinkling=wrinkling)
     reason = np.asarray(top.status)
     lost = np.where(top.status == Status.UNSTABLE, high, np.inf)  # lowest voltage known to be beyond
@@ -134,6 +136,9 @@ def pull_in_voltage(
     found = solve_many(specimen, displacement, low, tolerance=1e-6, wrinkling=wrinkling)
     # Close to the fold the solver may give up before it can tell why.
     low, pulled = np.asarray(low), np.asarray(lost < low * (1.0 + max(0.01, tolerance)))
+    # Next to slack nothing has stiffness left that could tell the two ends apart; the force is gone there anyway.
+    slackens = np.asarray(low >= slack * (1.0 - NEXT_TO_SLACK))
+    pulled &= ~slackens
     if wrinkling == "plain":
         for i in np.ndindex(low.shape):
             if not pulled[i]:
@@ -142,7 +147,7 @@ def pull_in_voltage(
             if fold is not None:
                 low[i] = fold
     answer = _where(pulled, low, found)
-    status = np.where(pulled, found.status, np.where(top.answered, Status.SLACK, reason)).astype(np.int8)
+    status = np.where(pulled, found.status, np.where(top.answered | slackens, Status.SLACK, reason)).astype(np.int8)
     return Limit(answer.voltage, answer.force, answer.peak_field, answer.min_hoop_stress, status)
 
 

@@ -20,8 +20,9 @@ def command(log: Path | None, port: int, browser: bool, terminal: bool) -> None:
     The page has a Stop button (also: Esc key). It is served on this machine only, by a process of its own that the run
     does not wait for. Close it with Ctrl-C: the run goes on.
     """
-    with suppress(OSError, AttributeError):
-        os.nice(10)  # the run comes first
+    if hasattr(os, "nice"):
+        with suppress(OSError):
+            os.nice(10)  # the run comes first
     if terminal:
         from rig.panel.terminal import watch
 

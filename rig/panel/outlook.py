@@ -103,8 +103,9 @@ def _numbers(values: Any) -> list[float | None]:
 
 def main() -> None:
     """Read ``{"scene": ..., "protocol": ...}`` from standard input and write the outlook to standard output."""
-    with suppress(OSError, AttributeError):
-        os.nice(10)
+    if hasattr(os, "nice"):
+        with suppress(OSError):
+            os.nice(10)
     texts = json.load(sys.stdin)
     try:
         found = outlook(texts["scene"], texts["protocol"])

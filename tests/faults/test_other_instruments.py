@@ -88,7 +88,7 @@ def test_an_error_during_the_ramp_down_does_not_keep_the_emergency_off_from_bein
         bench.inject(Fault(role="hv", kind="silent", at_s=bench.now + 0.5))
 
     story = tell(mischief, scene=scene)
-    assert story.outcome.status == "stopped" and not story.outcome.safe
+    assert story.outcome.status == "NOT SAFE" and not story.outcome.safe
     words = story.control_words
     assert set(words[words.index("switch_off") + 1 :]) == {"emergency_off"}
     assert abs(story.final_output) < 60

@@ -50,7 +50,7 @@ def ports(scene: Path, tmp_path: Path) -> Iterator[Path]:
             assert bench.stdout is not None
             path = tmp_path / "ports.json"
             path.write_text(bench.stdout.readline())
-            assert set(json.loads(path.read_text())) == {"stage", "force", "displacement", "hv"}
+            assert set(json.loads(path.read_text())) == {"served_by", "stage", "force", "displacement", "hv"}
             yield path
         finally:
             bench.terminate()
