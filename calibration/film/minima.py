@@ -25,7 +25,15 @@ SAME_MINIMUM = 0.5  # chi-square by which two minima may differ and count as one
 
 
 def scaled(materials: Sequence[Material], curves: Sequence[Curve]) -> list[Material]:
-    """The materials made as stiff as the curves with the least voltage say they are."""
+    """The materials made as stiff as the curves with the least voltage say they are.
+
+    A material that has no state at the film's stretches (a Gent film drawn beyond its limit) is left out.
+
+    Raises
+    ------
+    IdentificationError
+        None of them has, or the force does not rise with the displacement.
+    """
     rows = [curve.usable & (curve.h > 0.0) for curve in curves]
     given = [(curve, used) for curve, used in zip(curves, rows, strict=True) if used.any()]
     if not given:  # why, the selection of samples will tell
@@ -39,6 +47,8 @@ def scaled(materials: Sequence[Material], curves: Sequence[Curve]) -> list[Mater
     solved = solve_many(specimens, grid, tolerance=1e-5).force
     scaled = []
     for material, forces in zip(materials, solved, strict=True):
+        if not (np.isfinite(forces).sum(axis=1) > 1).all():
+            continue
         measured_by_model = model_squared = 0.0
         for (curve, used), places, force in zip(plain, grid, forces, strict=True):
             known = np.isfinite(force)
@@ -52,6 +62,11 @@ def scaled(materials: Sequence[Material], curves: Sequence[Curve]) -> list[Mater
             )
         ratio = measured_by_model / model_squared
         scaled.append(replace(material, mu=tuple(mu * ratio for mu in material.mu)))
+    if not scaled:
+        raise IdentificationError(
+            "the law has no state at the stretches of these films with any of its starting values: are pre-stretch and "
+            "radii right, and does the scene's material reach these stretches?"
+        )
     return scaled
 
 
