@@ -159,7 +159,7 @@ from rig.base.clock import RealClock
 from rig.sim.bench import SimulatedBench
 from rig.sim.server import Server
 from rig.sim.settings import SimulationSettings
-from tests.sim.conftest import closed_form, specimen
+from tests.rig.sim.conftest import closed_form, specimen
 
 settings = SimulationSettings.model_validate({"seed": 1, "force": {"stored_rate_Hz": 1000.0}})
 bench = SimulatedBench(settings, specimen(), {"stage", "force", "displacement"}, solve=closed_form)
