@@ -249,8 +249,8 @@ class RunView:
 
     @property
     def age(self) -> float:
-        """Seconds since something new was read; 0 once the log has ended."""
-        return 0.0 if self._follower.ended else time.monotonic() - self._arrived
+        """Seconds since something new was read; 0 once the log has said how the run ended."""
+        return 0.0 if "outcome" in self._metadata else time.monotonic() - self._arrived
 
     @property
     def simulated(self) -> bool:

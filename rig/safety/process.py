@@ -386,8 +386,8 @@ class Server:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _leave(self, guard: Guard) -> None:
-        """The engine has gone without taking leave, or from a supply that it had commanded and not measured off."""
-        cause = "the engine has ended without taking leave"
+        """The engine ended without a shutdown message, or from a supply that it had commanded and not measured off."""
+        cause = "the engine has ended without a shutdown message"
         if self._dismissed:
             cause = "the engine has ended before the output was measured off"
         began = self._clock.now()

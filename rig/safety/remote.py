@@ -288,7 +288,7 @@ class RemoteGuard:
         try:
             messages = self._channel.receive()
         except ChannelDamaged as error:
-            self._lose(f"it talks nonsense: {error}")
+            self._lose(f"its messages are corrupt: {error}")
             return
         if messages:
             self._heard_at = self._clock.now()

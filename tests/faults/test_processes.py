@@ -80,7 +80,7 @@ def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
     off_after(stand, at, KILLED_S)
     stand.wait_until_alone(live)
     stays_off(stand, at)
-    assert "without taking leave. The high voltage is off, measured" in live.said
+    assert "without a shutdown message. The high voltage is off, measured" in live.said
     # The guard's own end of the log outlives the engine: the command, and the measured proof of what came of it.
     part = live.log.with_name(live.log.name + ".part")
     stand.wait(lambda: read_log(part).ended, "the log's end")  # its writer is the last one to go
