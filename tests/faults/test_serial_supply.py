@@ -36,7 +36,7 @@ CHANGES = {
 
 def guard_of(engine: int) -> int:
     children = Path(f"/proc/{engine}/task/{engine}/children").read_text().split()
-    return next(int(pid) for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    return next(int(pid) for pid in children if b"rig.safety.process" in Path(f"/proc/{pid}/cmdline").read_bytes())
 
 
 @pytest.mark.parametrize("who", ["engine", "guard"])
