@@ -23,14 +23,20 @@ def reported(found: Identification) -> bool:
     return any("the model does not explain the data" in warning for warning in found.warnings)
 
 
-def test_coverage_of_the_stated_intervals(experiment: Experiment) -> None:
-    """200 experiments whose zeros and gains are drawn from their stated uncertainties: 90 to 99 % of the 95 % intervals
+@pytest.mark.parametrize(
+    ("experiments", "least", "most", "spread"),
+    [(50, 0.86, 1.0, 0.3), pytest.param(200, 0.90, 0.99, 0.2, marks=[pytest.mark.long, pytest.mark.timeout(3600)])],
+)
+def test_coverage_of_the_stated_intervals(
+    experiment: Experiment, experiments: int, least: float, most: float, spread: float
+) -> None:
+    """Experiments whose zeros and gains are drawn from their stated uncertainties: 90 to 99 % of 200 of the 95 % intervals
     of permittivity and stiffness hold the truth, and a right model is hardly ever called wrong. Nor are the intervals
-    far too wide: errors in stated uncertainties scatter by one (known to 5 %).
+    far too wide: errors in stated uncertainties scatter by one (known to 5 %). The bounds for 50 are wider by chance.
     """
     scores: dict[str, list[float]] = {"eps_r": [], "stiffness": []}
     alarms = 0
-    for seed in range(200):
+    for seed in range(experiments):
         curves = experiment(seed=1000 + seed, samples=120, gains=True, truth=PARKER, guess=NEAR)
         found = identify(curves, terms=2, starts=1)
         alarms += reported(found)
@@ -38,9 +44,9 @@ def test_coverage_of_the_stated_intervals(experiment: Experiment) -> None:
             scores[name].append((found.quantities[name].value - known) / found.quantities[name].uncertainty)
     for name, z in scores.items():
         covered = float(np.mean(np.abs(z) < 1.96))
-        assert 0.90 <= covered <= 0.99, (name, covered, np.std(z), np.mean(z))
-        assert 0.8 < np.std(z) < 1.2, (name, np.std(z))
-    assert alarms <= 10, alarms
+        assert least <= covered <= most, (name, covered, np.std(z), np.mean(z))
+        assert abs(np.std(z) - 1.0) < spread, (name, np.std(z))
+    assert alarms <= experiments / 20, alarms
 
 
 @pytest.mark.parametrize(
