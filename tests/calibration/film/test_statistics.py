@@ -30,7 +30,7 @@ def reported(found: Identification) -> bool:
 def test_coverage_of_the_stated_intervals(
     experiment: Experiment, experiments: int, least: float, most: float, spread: float
 ) -> None:
-    """Experiments whose zeros and gains are drawn from their stated uncertainties: 90 to 99 % of 200 of the 95 % intervals
+    """Zeros and gains are drawn from their stated uncertainties: of 200 experiments, 90 to 99 % of the 95 % intervals
     of permittivity and stiffness hold the truth, and a right model is hardly ever called wrong. Nor are the intervals
     far too wide: errors in stated uncertainties scatter by one (known to 5 %). The bounds for 50 are wider by chance.
     """
