@@ -145,8 +145,8 @@ def ascii_on_the_wire(value: str, wire: bytes) -> bool:
     words = [c[1].strip().lower() for c in columns if len(c) == 3]
     if "nan" in value:
         return bool({"nan", "inf", "+inf", "-inf", "ovf"} & set(words))
-    numbers = [word for word in words if re.fullmatch(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", word) and word.count(".") < 2]
-    return value in {repr(ascii_stream.Value(float(word))) for word in numbers if word not in (".", "+.", "-.")}
+    numbers = [word for word in words if re.fullmatch(r"[-+]?[0-9]*\.?[0-9]*(e[-+]?[0-9]+)?", word)]
+    return value in {repr(ascii_stream.Value(float(word))) for word in numbers if re.match(r"[-+]?\.?[0-9]", word)}
 
 
 # -- shvps
