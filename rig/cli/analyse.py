@@ -1,4 +1,4 @@
-"""``dea-rig analyse``: statistics over specimens."""
+"""``dea-rig analyse``: statistics over many specimens."""
 
 from __future__ import annotations
 

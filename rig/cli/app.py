@@ -44,6 +44,14 @@ class Commands(click.Group):
         entry = _others().get(cmd_name)
         return None if entry is None else _load(entry)
 
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """One line for each command. Ours stands at the top of its file, so that no command is imported for it."""
+        own, others = _own(), _others()
+        lines = {name: _load(entry).get_short_help_str(200) for name, entry in others.items()}
+        lines |= {name: _first_line(module) for name, module in own.items()}
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(lines.items()))
+
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
@@ -80,6 +88,13 @@ def _own() -> dict[str, str]:
     """Command name -> module of this package."""
     modules = {file.stem for file in Path(__file__).parent.glob("[a-z]*.py")}
     return {name.rstrip("_").replace("_", "-"): name for name in modules - HELPERS}
+
+
+def _first_line(module: str) -> str:
+    """What a command does, of the first line of its file: three quotes, its name in back quotes, a colon, this."""
+    with (Path(__file__).parent / f"{module}.py").open(encoding="utf-8") as file:
+        said = file.readline().rstrip().removesuffix('"""').partition("``: ")[2]
+    return said[:1].upper() + said[1:]
 
 
 def _others() -> dict[str, EntryPoint]:

@@ -1,4 +1,4 @@
-"""``dea-rig benchmark ...``: measurements of the project itself."""
+"""``dea-rig benchmark``: error against run time, and other measurements of this software."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig calibrate``: from a scene, or the log of an earlier calibration, to a certificate."""
+"""``dea-rig calibrate``: calibrate an instrument and write its certificate."""
 
 from __future__ import annotations
 

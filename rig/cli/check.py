@@ -1,4 +1,4 @@
-"""``dea-rig check``: the plan of a protocol and what the model predicts of it."""
+"""``dea-rig check``: the plan of a protocol, and what the model predicts of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig demo``: the main job on the simulated bench, from two specimens to their parameters beside the truth."""
+"""``dea-rig demo``: two simulated specimens, from the run to the report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig design``: a study from its file to its pictures, on this machine or on a Dask cluster."""
+"""``dea-rig design``: a design study, from its file to its pictures."""
 
 from __future__ import annotations
 

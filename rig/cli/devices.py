@@ -1,4 +1,4 @@
-"""``dea-rig devices``: who answers on which port and bus."""
+"""``dea-rig devices``: who answers on which port and bus, and the lines for the scene."""
 
 from __future__ import annotations
 

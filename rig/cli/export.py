@@ -1,4 +1,4 @@
-"""``dea-rig export``: a log as a table."""
+"""``dea-rig export``: a log as a table, with units in the header."""
 
 from __future__ import annotations
 

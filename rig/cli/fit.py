@@ -1,4 +1,4 @@
-"""``dea-rig fit``: the film's parameters from logs."""
+"""``dea-rig fit``: the film's law and permittivity from logs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig init``: a folder with scene, protocols and certificates for a film that one has."""
+"""``dea-rig init``: scene, protocols and certificates for your film."""
 
 from __future__ import annotations
 

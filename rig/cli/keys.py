@@ -1,4 +1,4 @@
-"""``dea-rig keys``: what may stand in each file, from where its keys are declared."""
+"""``dea-rig keys``: every key of every file: unit, meaning, default, range."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig note``: a note on a log."""
+"""``dea-rig note``: add a note on a log."""
 
 from __future__ import annotations
 

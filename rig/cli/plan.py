@@ -1,4 +1,4 @@
-"""``dea-rig plan``: a protocol that tells most about a film in the time there is."""
+"""``dea-rig plan``: propose a protocol that tells most about a film in a given time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig recover``: what can be read of a damaged log."""
+"""``dea-rig recover``: save what can be read of a damaged log."""
 
 from __future__ import annotations
 

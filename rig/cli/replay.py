@@ -1,4 +1,4 @@
-"""``dea-rig replay``: today's software held against a log."""
+"""``dea-rig replay``: hold today's software against a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig resume``: the rest of a run that ended early."""
+"""``dea-rig resume``: go on with a run that ended early."""
 
 from __future__ import annotations
 

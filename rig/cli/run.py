@@ -1,4 +1,4 @@
-"""``dea-rig run``: a protocol on the bench of a scene, into a log."""
+"""``dea-rig run``: run a protocol on the bench of a scene, into a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig runs``: the logs of a folder."""
+"""``dea-rig runs``: list and search the logs of a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dea-rig sim``: the simulated bench behind pseudo-terminals."""
+"""``dea-rig sim``: serve the simulated bench on pseudo-terminals."""
 
 from __future__ import annotations
 

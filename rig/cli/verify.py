@@ -1,4 +1,4 @@
-"""``dea-rig verify``: does a sensor still agree with its certificate? One standard, every morning."""
+"""``dea-rig verify``: does a sensor still agree with its certificate? One standard."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from rig.cli.app import main
 from rig.run.backend import simulated_bench
 from rig.scene.scene import load_scene
 from rig.sim.served import ServedBench
@@ -36,6 +37,21 @@ def test_help_imports_nothing_heavy() -> None:
         "assert CliRunner().invoke(main, ['--help']).exit_code == 0"
     )
     assert imported_by(code) == set()
+
+
+def test_help_imports_no_command_and_says_of_each_what_it_does_in_one_line() -> None:
+    code = (
+        "import sys\nfrom click.testing import CliRunner\nfrom rig.cli.app import main\n"
+        "print(CliRunner().invoke(main, ['--help']).output)\n"
+        "print(*(m for m in sys.modules if m.startswith('rig')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    *page, modules = done.stdout.splitlines()
+    assert set(modules.split()) == {"rig", "rig.cli", "rig.cli.app"}
+    for name in main.list_commands(None):  # type: ignore[arg-type]
+        [line] = [line for line in page if line.startswith(f"  {name} ")]
+        assert len(line) <= 80 and len(line.split()) > 3, line
+    assert all(len(line) <= 80 for line in page)
 
 
 def test_the_help_of_each_command_imports_nothing_heavy() -> None:
