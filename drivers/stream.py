@@ -38,7 +38,7 @@ class Stream(Generic[S]):
     ) -> None:
         self._device = device
         self._rate = rate_Hz
-        self._patience = max(timeout_s, 5.0 / rate_Hz)
+        self._silence_limit_s = max(timeout_s, 5.0 / rate_Hz)
         self._interval = poll_interval_s
         self._clock: SampleClock[S | None] = SampleClock(rate_Hz, counters)
         self._heard = math.inf  # the first poll sets it
@@ -67,7 +67,7 @@ class Stream(Generic[S]):
         stamped = self._clock.feed(now, list(arrived))
         if any(sample is not None for sample in arrived):
             self._heard = now
-        elif now - self._heard > self._patience:
+        elif now - self._heard > self._silence_limit_s:
             silent_s, self._heard = now - self._heard, now
             self._clock.count_anew()  # what is missing has been told
             raise DeviceSilent(

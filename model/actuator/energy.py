@@ -1,4 +1,4 @@
-"""Energy of a film and its charge, from its profile: an account of an actuator's work that no force enters.
+"""Energy of a film and its charge, from its profile: the balance of an actuator's work that no force enters.
 
 At a displacement ``h`` and voltage ``V`` the film stores ``U = integral 2 pi R (T/lp^2) W dR`` in its elastomer and
 ``C V^2/2`` between its electrodes, ``C = eps integral 2 pi R (l1 l2)^2 / (lp^2 T) dR``, in folds with the natural
@@ -79,7 +79,7 @@ def _panels() -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Account:
+class EnergyBalance:
     """Where the energy of a stroke comes from and goes (J). Without a snap nothing is lost: the sums agree.
 
     Attributes
@@ -124,8 +124,8 @@ def _bias_work(actuator: Actuator, rest: float, reached: float) -> float:
     return float((reached - rest) * (actuator.bias.force(rest + (reached - rest) * nodes) @ weights))
 
 
-def account(actuator: Actuator, rest: float, reached: float, voltage: float) -> Account:
-    """The account of a stroke without snaps, from `model.actuator.stroke.strokes`.
+def energy_balance(actuator: Actuator, rest: float, reached: float, voltage: float) -> EnergyBalance:
+    """The energy balance of a stroke without snaps, from `model.actuator.stroke.strokes`.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def account(actuator: Actuator, rest: float, reached: float, voltage: float) -> 
     rise = -there.stiffness[0] / there.by_voltage[0]
     q_dv = (reached - rest) * float((charge * rise) @ weights)
     work = work_by_energy(actuator, rest, reached, voltage)
-    return Account(
+    return EnergyBalance(
         work=work,
         source=voltage * done.charge - q_dv,
         bias=_bias_work(actuator, rest, reached),

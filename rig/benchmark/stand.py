@@ -23,7 +23,7 @@ from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.served import Driven, ServedBench
 
-PATIENCE_S = 60.0  # with a machine that does much else
+WAIT_S = 60.0  # with a machine that does much else
 LOOK_S = 0.005
 
 # From the scene of the examples to one with short ways. The time-outs are not what is tried here.
@@ -167,7 +167,7 @@ class Stand:
         """Put a port that was pulled back, under its name; gives back when it was there."""
         before = self.bench.ports[role]
         self.do(lambda bench: bench.wire(role).restore())
-        self.wait(lambda: self.bench.ports[role] != before, "the port", PATIENCE_S)
+        self.wait(lambda: self.bench.ports[role] != before, "the port", WAIT_S)
         self.ports()
         return self.bench.clock.now()
 
@@ -177,7 +177,7 @@ class Stand:
         os.kill(pid, number)
         return at
 
-    def wait(self, done: Callable[[], bool], what: str, seconds: float = PATIENCE_S) -> None:
+    def wait(self, done: Callable[[], bool], what: str, seconds: float = WAIT_S) -> None:
         """Until ``done()``.
 
         Raises
@@ -218,7 +218,7 @@ class Stand:
 
     def _line(self) -> str:
         while b"\n" not in self._buffer:
-            self._read(PATIENCE_S)
+            self._read(WAIT_S)
         line, _, self._buffer = self._buffer.partition(b"\n")
         return line.decode()
 
@@ -258,7 +258,7 @@ class Stand:
         if self._server is not None:
             assert self._server.stdin is not None and self._server.stdout is not None
             self._server.stdin.close()
-            self._server.wait(PATIENCE_S)
+            self._server.wait(WAIT_S)
             self._server.stdout.close()
         self.bench.__exit__(*error)
 

@@ -35,7 +35,7 @@ MOST_WAITING = 8 * 1024 * 1024  # bytes not yet taken by the writer: half a minu
 SILENCE_S = 0.8  # the writer says ten times a second that it lives, by a thread of its own ...
 LATE_S = 0.05  # a turn of ours that took longer is not the writer's silence
 BUSY_S = 5.0  # ... and for how long it has waited for its disk, which may keep it that long
-PATIENCE_S = 10.0  # for what may block: an attachment before the run, closing
+BLOCKING_S = 10.0  # for what may block: an attachment before the run, closing
 
 _TOPICS = {topic: number for number, topic in enumerate(schema.CHANNELS)}
 _AHEAD = {"/command", *(topic for topic in schema.CHANNELS if topic.endswith("/tx"))}  # sent before they take effect
@@ -173,7 +173,7 @@ class RemoteLog:
         while self._waiting:
             self._send()
             self._listen()
-            if clock.now() > PATIENCE_S:
+            if clock.now() > BLOCKING_S:
                 raise self._fail("the process that writes the log takes nothing more", "Its disk may hang.")
             if self._waiting:
                 select.select([], [self._end], [], 0.1)

@@ -31,8 +31,8 @@ from rig.scene.scene import Scene
 
 DECISIONS = ("/phase", "/target", "/reference", "/command")
 NANOSECONDS = 1e-8  # to which the times of turns are known
-PATIENCE_S = 0.1  # by how much a decision may come sooner or later than then: less than any device is silent for
-PATIENCE_TURNS = round(PATIENCE_S / SHORTEST_TURN_S)
+TOLERANCE_S = 0.1  # by how much a decision may come sooner or later than then: less than any device is silent for
+TOLERANCE_TURNS = round(TOLERANCE_S / SHORTEST_TURN_S)
 
 # The word in the log under which a supply's first call of each command stands.
 WORDS = {
@@ -100,7 +100,7 @@ class Steering:
         entry.waited += 1
         if entry.waited == 1:
             return entry.t
-        if entry.waited > PATIENCE_TURNS:
+        if entry.waited > TOLERANCE_TURNS:
             self._entries.popleft()
         return wanted
 
@@ -109,7 +109,7 @@ class Steering:
         if not _is_decision(topic, fields):
             return []
         decision = next((entry for entry in self._entries if isinstance(entry, _Decision)), None)
-        if decision is None or decision.topic != topic or decision.t > fields["t_s"] + PATIENCE_S:
+        if decision is None or decision.topic != topic or decision.t > fields["t_s"] + TOLERANCE_S:
             return []
         before: list[_Turn] = []
         while isinstance(entry := self._entries.popleft(), _Turn):
@@ -144,7 +144,7 @@ class Steering:
         if isinstance(item, _Command):
             if item.t <= now:
                 item.waited += 1
-            if item.waited > PATIENCE_TURNS:
+            if item.waited > TOLERANCE_TURNS:
                 self._supply.popleft()
             return None
         if item is None or (item > now + NANOSECONDS and (holding or not self.sample_taken())):

@@ -31,7 +31,7 @@ DEVIATION_SAMPLES = 2  # ... and so many samples in a row that show it outside, 
 FROZEN_SAMPLES = 25  # this many equal measurements of voltage and current in a row: last digits are never so quiet
 FROZEN_RAMP_V, FROZEN_RAMP_SAMPLES = 100.0, 3  # nor does a ramp over so much leave so many voltages equal
 FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
-RAMP_PATIENCE, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
+RAMP_MARGIN, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
 AT_ONCE_S = 4.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
 NOT_SAFE = f"NOT SAFE: the output was not measured off (below {SAFE_VOLTAGE:.0f} V, and the channel off)."
 ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
@@ -486,7 +486,7 @@ class Guard:
 
 def ramp_limit(duration: float) -> float:
     """How long a ramp down that should take ``duration`` may take in all (s)."""
-    return duration * RAMP_PATIENCE + RAMP_GRACE_S
+    return duration * RAMP_MARGIN + RAMP_GRACE_S
 
 
 def flag_names(flags: Flag) -> str:

@@ -1,8 +1,8 @@
 """The guard's process as the engine sees it: both the supply that it polls and the `Guard` that it asks.
 
 Calls are answered within milliseconds and wait for the answer, so that what the guard refuses is refused here too.
-When the guard's process is lost (dead, silent or talking nonsense), the engine takes the output off itself and goes on
-to measure it. For that it keeps its own descriptor of the link, and driver and rules made ready, from the beginning:
+When the guard's process is lost (dead, silent, or its messages are corrupt), the engine takes the output off itself and
+goes on to measure it. For that it keeps its own descriptor of the link, and driver and rules made ready, from the beginning:
 taking over needs no lock, no file, no new descriptor and nobody's consent, and off is sent again until it is measured.
 """
 
@@ -266,12 +266,12 @@ class RemoteGuard:
             self._calls += 1
             number = self._calls
             self._channel.send({"do": "call", "n": number, "name": name, "args": list(arguments)})
-            patience = ANSWER_S if self.commanded and name != "arm" else UNARMED_S
-            end = self._clock.now() + patience
+            time_out = ANSWER_S if self.commanded and name != "arm" else UNARMED_S
+            end = self._clock.now() + time_out
             while number not in self._answers and not self._lost:
                 left = end - self._clock.now()
                 if left <= 0:
-                    self._lose(f"it did not answer within {patience:g} s")
+                    self._lose(f"it did not answer within {time_out:g} s")
                     break
                 if not self._channel.closed:
                     select.select([self._channel], [], [], left)

@@ -17,7 +17,7 @@ from rig.sim.instruments.iseg import IsegEDCP
 from rig.sim.server import Server
 
 T = TypeVar("T")
-PATIENCE_S = 20.0
+ANSWER_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ServedBench:
                 answers.put(error)
 
         self._wanted.put(work)
-        answer = answers.get(timeout=PATIENCE_S)
+        answer = answers.get(timeout=ANSWER_S)
         if isinstance(answer, BaseException):
             raise answer
         return answer
@@ -113,5 +113,5 @@ class ServedBench:
 
     def __exit__(self, *error: object) -> None:
         self._stop.set()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(ANSWER_S)
         self._server.close()

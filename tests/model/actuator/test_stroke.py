@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import brentq
 
 from model.actuator.bias import Antagonist, Bias, Bistable, Mass, Spring
-from model.actuator.energy import account, stored, work_by_energy
+from model.actuator.energy import energy_balance, stored, work_by_energy
 from model.actuator.equilibrium import Actuator, equilibria
 from model.actuator.stroke import Criteria, Limit, Strokes, strokes
 from model.material.materials import NAMED, Material
@@ -165,7 +165,7 @@ def test_energy_given_is_energy_found(wrinkling: Wrinkling, lp: float, within: f
     """Along the path the source and the bias give what the film stores; folds give the path kinks, so 2e-4 there."""
     one = Actuator(film(lp), MASS, wrinkling)
     found = strokes([one], Criteria(field=STRENGTH))
-    sums = account(one, float(found.rest[0]), float(found.reached[0]), float(found.voltage[0]))
+    sums = energy_balance(one, float(found.rest[0]), float(found.reached[0]), float(found.voltage[0]))
     assert abs(sums.residual) < within
     assert sums.bias == pytest.approx(0.25 * found.stroke[0], rel=1e-9)
     assert 0.1 < sums.efficiency < 0.4
