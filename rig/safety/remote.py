@@ -2,8 +2,9 @@
 
 Calls are answered within milliseconds and wait for the answer, so that what the guard refuses is refused here too.
 When the guard's process is lost (dead, silent, or its messages are corrupt), the engine takes the output off itself and
-goes on to measure it. For that it keeps its own descriptor of the link, and driver and rules made ready, from the beginning:
-taking over needs no lock, no file, no new descriptor and nobody's consent, and off is sent again until it is measured.
+goes on to measure it. For that it keeps its own descriptor of the link, and driver and rules made ready, from the
+beginning: taking over needs no lock, no file, no new descriptor and nobody's consent, and off is sent again until it is
+measured.
 """
 
 from __future__ import annotations
