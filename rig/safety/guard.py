@@ -83,6 +83,7 @@ class Guard:
         self.setpoint = 0.0
         self.ramps_down = False  # whether the last off was a ramp, which takes its time
         self._supply = supply
+        self._renew = supply.renew if isinstance(supply, Renewed) else None  # asked here once: it is slow
         self._limits = limits
         self._film = film
         self._ramp = ramp
@@ -302,8 +303,8 @@ class Guard:
             except LimitError as error:
                 self.kill(str(error))
                 raise
-        if isinstance(self._supply, Renewed):
-            self._supply.renew()
+        if self._renew is not None:
+            self._renew()
 
     def _judge_engine(self, now: float) -> None:
         if self._alive_at is None:
