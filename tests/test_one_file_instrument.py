@@ -138,6 +138,7 @@ def test_its_keys_and_faults_are_checked(place: Place) -> None:
     place.rig("check", "scene.toml", "protocol.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
 def test_it_is_served_found_and_run_on_its_port(place: Place, ports: dict[str, dict[str, str]]) -> None:
     found = place.rig("devices", "--port", ports["force"]["port"])

@@ -122,6 +122,7 @@ def test_a_leg_is_half_a_second_and_the_braking_but_not_much_shorter_than_what_a
     assert travelled > 0.9e-3 and story.stage_words.count("move_to") <= 3 + travelled / (0.3 * leg)
 
 
+@pytest.mark.slow
 def test_an_engine_that_hangs_leaves_the_stage_within_a_leg_and_goes_on_where_it_stands(
     tell: Tell, ways: list[Way], monkeypatch: pytest.MonkeyPatch
 ) -> None:

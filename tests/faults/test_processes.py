@@ -22,7 +22,7 @@ from rig.safety.remote import LEAVE_S
 from rig.sim.bench import SimulatedBench
 from rig.sim.truth import Fault
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
+pytestmark = [pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX"), pytest.mark.slow]
 
 TRIES = 3
 BACK_S = 2.0  # twice what is required
@@ -73,7 +73,7 @@ def stays_off(stand: Stand, at: float) -> None:
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGKILL, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGSEGV, signal.SIGABRT))],
+    [signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT],
 )
 def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
     at = stand.kill(live.engine, number)
@@ -101,7 +101,7 @@ def slow_stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGKILL, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGSTOP, signal.SIGUSR1))],
+    [signal.SIGKILL, signal.SIGSTOP, signal.SIGUSR1],
     ids=["killed", "stopped", "busy"],
 )
 def test_engine_gone_on_the_way_to_contact_leaves_the_stage_within_a_leg(
@@ -126,7 +126,6 @@ def test_engine_gone_on_the_way_to_contact_leaves_the_stage_within_a_leg(
     slow_stand.wait_until_alone(run)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGUSR1], ids=["stopped", "busy"])
 def test_engine_hung(stand: Stand, live: Run, number: signal.Signals) -> None:
     """Stopped, or in a loop that never comes back (the fork server's handler of SIGUSR1)."""
@@ -140,7 +139,6 @@ def test_engine_hung(stand: Stand, live: Run, number: signal.Signals) -> None:
     stays_off(stand, at)
 
 
-@pytest.mark.slow
 def test_engine_that_was_stopped_and_goes_on_gets_no_voltage_any_more(stand: Stand, live: Run) -> None:
     at = stand.kill(live.engine, signal.SIGSTOP)
     off_after(stand, at, HUNG_S)
@@ -174,7 +172,6 @@ def test_guard_that_hangs_is_ended_and_replaced_by_the_engine(stand: Stand, live
     assert read_log(live.log).outcome["safe"] == "yes"  # type: ignore[index]
 
 
-@pytest.mark.slow
 def test_guard_ignores_signals_that_end_programs(stand: Stand, live: Run) -> None:
     at = stand.bench.clock.now()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
@@ -187,7 +184,6 @@ def test_guard_ignores_signals_that_end_programs(stand: Stand, live: Run) -> Non
     stays_off(stand, at)
 
 
-@pytest.mark.slow
 def test_engine_and_guard_killed_leave_the_voltage_to_the_hardware(stand: Stand, live: Run) -> None:
     """Stated plainly: nothing in software is left to act. The next start finds the output live and touches nothing."""
     at = stand.kill(live.guard, signal.SIGSTOP)
@@ -204,7 +200,6 @@ def test_engine_and_guard_killed_leave_the_voltage_to_the_hardware(stand: Stand,
     assert stand.off_after(at) is None and stand.bench.voltage() > 780.0
 
 
-@pytest.mark.slow
 def test_engine_killed_with_a_supply_that_does_not_obey_is_called_not_safe(stand: Stand, live: Run) -> None:
     def stick(bench: SimulatedBench) -> None:
         bench.inject(Fault(role="hv", kind="stuck_on"))
@@ -219,7 +214,6 @@ def test_engine_killed_with_a_supply_that_does_not_obey_is_called_not_safe(stand
     assert "The high voltage is off, measured" in live.said
 
 
-@pytest.mark.slow
 def test_a_guard_whose_engine_takes_leave_of_a_live_output_stays_and_tries_on(stand: Stand, live: Run) -> None:
     stand.do(lambda bench: bench.inject(Fault(role="hv", kind="stuck_on")))
     at = stand.kill(live.engine, signal.SIGINT)
@@ -237,7 +231,6 @@ def test_a_guard_whose_engine_takes_leave_of_a_live_output_stays_and_tries_on(st
     assert (outcome["safe"], outcome["status"]) == ("NO", "NOT SAFE") and outcome["reason"].startswith("stopped by")
 
 
-@pytest.mark.slow
 def test_a_bus_that_is_pulled_with_voltage_on_ends_the_run_as_not_safe(stand: Stand, live: Run) -> None:
     at = stand.pull("hv")
     stand.wait(lambda: live.status is not None, "the engine's end")
@@ -270,7 +263,6 @@ def test_an_adapter_that_is_pulled_and_comes_back_is_found_again_and_the_output_
     assert "is open again" in "".join(m.fields["message"] for m in log.messages("/event"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("first", ["guard killed", "pulled"])
 def test_a_guard_killed_while_the_adapter_is_out_leaves_the_engine_to_take_the_output_off(
     stand: Stand, live: Run, first: str
@@ -290,7 +282,6 @@ def test_a_guard_killed_while_the_adapter_is_out_leaves_the_engine_to_take_the_o
     assert live.status == 4
 
 
-@pytest.mark.slow
 def test_a_second_run_on_the_same_ports_is_refused_and_disturbs_nothing(stand: Stand, live: Run) -> None:
     at = stand.bench.clock.now()
     second = stand.start(power_cycle=False)

@@ -21,7 +21,7 @@ ROWS: dict[int, Row] = {
         "the guard commands the output off and records that",
         [
             "faults/test_processes.py::test_engine_killed",
-            "faults/test_kills.py::test_engine_killed_at_200_random_instants",
+            "faults/test_kills.py::test_engine_killed_at_random_instants",
             "faults/test_serial_supply.py::test_killed",
         ],
     ),

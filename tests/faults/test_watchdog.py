@@ -40,6 +40,7 @@ CHANGES = {
 }
 pytestmark = [
     pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for processes in /proc"),
+    pytest.mark.slow,
     pytest.mark.timeout(120),
 ]
 

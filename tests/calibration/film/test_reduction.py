@@ -139,6 +139,7 @@ def test_samples_are_carried_to_one_voltage() -> None:
     assert uncorrected.floor > 100 * block.floor
 
 
+@pytest.mark.slow
 def test_wrinkled_samples_are_left_out_and_counted() -> None:
     """Without pre-stretch the film loses hoop tension well below 1900 V (onset near 48 MV/m at h = 12 mm)."""
     specimen = replace(SPECIMEN, prestretch=1.0)

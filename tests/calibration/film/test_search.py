@@ -98,6 +98,7 @@ def test_a_starting_point_without_a_state_is_told_and_bounds_are_kept(experiment
 # --- comparison of models
 
 
+@pytest.mark.slow
 def test_models_are_compared_by_criteria_and_by_held_out_specimens(experiment: Experiment) -> None:
     """Two films of different disks, but one material: what one says predicts the other to within the noise."""
     found = compare(experiment(seed=31, samples=300), starts=3)

@@ -156,6 +156,7 @@ def test_error_falls_with_the_fourth_power_of_the_step() -> None:
     assert errors[-1] > 1e-10  # the exact value is far better than what it judges
 
 
+@pytest.mark.slow
 def test_answers_between_steps_and_in_any_order() -> None:
     (t, h, voltage), _ = HOLD, STEPS
     specimen = film([(0.3, 2.0), (0.1, 20.0)])
@@ -186,6 +187,7 @@ def test_gent_films_take_time_too() -> None:
     np.testing.assert_allclose(one.force, other.force, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_dissipation_is_never_negative_and_no_work_is_won_in_a_cycle() -> None:
     t = np.linspace(0.0, 40.0, 401)
     h = 5e-3 - 4e-3 * np.cos(t * np.pi / 10.0)

@@ -16,6 +16,7 @@ def assert_agreed(report: Report, states: int) -> None:
     assert report.unstable > 0.1 * states  # it is about the end of branches
 
 
+@pytest.mark.slow
 def test_fifty_states_around_loss_of_convexity() -> None:
     assert_agreed(run(50, seed=1, truth=0), 50)
 

@@ -15,6 +15,8 @@ from rig.log.reader import read_log
 from rig.protocol.experiment import prepare
 from rig.run.run import run
 
+pytestmark = pytest.mark.slow  # the whole of it, two films
+
 LOGS = ("cone-4mm.mcap", "cone-6mm.mcap")
 TRUTH = NAMED["parker-cao2018"]  # what sim_fixtures/scenes/cone-*.toml hide in [simulation.film]
 

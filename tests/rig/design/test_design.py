@@ -101,6 +101,7 @@ def test_peak_field_of_figure_6_is_lowest_for_a_disk_of_5_mm() -> None:
 # ---- figure S2
 
 
+@pytest.mark.slow
 def test_the_bias_line_meets_the_breakdown_boundary_where_the_stroke_ends() -> None:
     study = load_study(STUDIES / "figureS2.toml")
     assert isinstance(study, BoundaryStudy)
@@ -245,6 +246,7 @@ def same(one: Sequence[Row], other: Sequence[Row]) -> bool:
     return repr(list(one)) == repr(list(other))
 
 
+@pytest.mark.slow
 def test_any_executor_gives_the_same_table() -> None:
     told: list[tuple[int, int]] = []
     alone = sweep(small(), progress=lambda done, total: told.append((done, total)))
@@ -264,6 +266,7 @@ def test_processes_give_the_same_table() -> None:
 # ---- files and the command
 
 
+@pytest.mark.slow
 def test_command_writes_pictures_and_a_table_and_overwrites_nothing(tmp_path: Path) -> None:
     study = tmp_path / "small.toml"
     study.write_text(

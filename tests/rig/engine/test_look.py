@@ -19,6 +19,8 @@ from rig.operator.status import Status
 from rig.protocol.experiment import gains_of, prepare
 from rig.run.backend import open_bench
 
+pytestmark = pytest.mark.slow  # the whole protocol of the paper
+
 FIXTURES = Path(str(files("sim_fixtures")))
 
 

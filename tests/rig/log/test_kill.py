@@ -146,7 +146,11 @@ def kill(folder, victim, count, allowed_s):
     assert (np.array(lost_ms) <= 1e3 * allowed_s + 3 * np.array(late_ms)).all()
 
 
-COUNTS = [pytest.param(10, id="some"), pytest.param(200, id="many", marks=pytest.mark.slow)]
+COUNTS = [
+    pytest.param(10, id="some"),
+    pytest.param(60, id="more", marks=pytest.mark.slow),
+    pytest.param(200, id="many", marks=pytest.mark.long),
+]
 
 
 @pytest.mark.parametrize("count", COUNTS)

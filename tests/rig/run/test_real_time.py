@@ -72,6 +72,7 @@ def dea_rig(*arguments: str | Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_the_job_end_to_end(scene: Path, ports: Path, tmp_path: Path) -> None:
     log, fit = tmp_path / "run.mcap", tmp_path / "fit.json"
     run = dea_rig("run", scene, FIXTURES / "protocols/short.toml", "-o", log, "--ports", ports, "--arm", "--yes")

@@ -74,6 +74,7 @@ def test_table_and_picture(short, tmp_path):
     assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_what_a_fit_does_not_know_is_told(short, tmp_path):
     """First order against drawn films: the expectation's uncertainty is that of the fit."""
     relative = {"mu1": 0.004, "alpha1": 0.003, "mu2": 0.002, "alpha2": 0.002, "eps_r": 0.01}
