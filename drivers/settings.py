@@ -164,7 +164,7 @@ class StageSettings(InstrumentSettings):
         default=0.0,
         ge=0,
         description="Stage position (mm), short of the film, to which it goes fast and where the slow approach begins.",
-        json_schema_extra={"usual": [0, 300]},
+        json_schema_extra={"usual": [0.5, 300]},
     )
 
 

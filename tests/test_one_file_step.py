@@ -118,7 +118,8 @@ def test_its_errors_list_its_own_keys_and_its_plan_refuses_in_the_family(other_p
     assert "step 4, time: unknown key; did you mean times? Allowed here: depth_mm, do, times." in done.stderr
     protocol.write_text(PROTOCOL.replace("depth_mm = 0.8", "depth_mm = 3"))
     done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
-    assert (done.returncode, done.stderr) == (3, "Step 4 (knock): more than 1 mm is no knock.\n")
+    where = f"{protocol} on {SCENES / 'no-hv.toml'}"
+    assert (done.returncode, done.stderr) == (3, f"{where}: Step 4 (knock): more than 1 mm is no knock.\n")
     protocol.write_text(PROTOCOL.replace('"knock"', '"knok"'))
     done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
     assert done.returncode == 2 and 'did you mean "knock"?' in done.stderr

@@ -68,19 +68,19 @@ class Material:
     def __post_init__(self) -> None:
         object.__setattr__(self, "mu", tuple(float(m) for m in self.mu))
         object.__setattr__(self, "alpha", tuple(float(a) for a in self.alpha))
-        label = f"material {self.name!r}"
+        label = f"material {self.name!r}: " if self.name else ""
         try:
             self.law.check(self.mu, self.alpha)
         except ValueError as error:
-            raise ValueError(f"{label}: {error}") from None
+            raise ValueError(f"{label}{error}") from None
         if not 0.0 < self.eps_r < math.inf:
-            raise ValueError(f"{label}: eps_r = {self.eps_r!r}; it must be positive and finite")
+            raise ValueError(f"{label}eps_r = {self.eps_r!r}; it must be positive and finite")
         for name, limit, least in (
             ("breakdown_field", self.breakdown_field, 0.0),
             ("max_stretch", self.max_stretch, 1.0),
         ):
             if limit is not None and not least < limit < math.inf:
-                raise ValueError(f"{label}: {name} = {limit!r}; it must be above {least:g} and finite, or None")
+                raise ValueError(f"{label}{name} = {limit!r}; it must be above {least:g} and finite, or None")
 
     @classmethod
     def with_law(

@@ -71,7 +71,7 @@ class Film:
     def specimen(self) -> Specimen:
         """The same in SI units."""
         raw = {**self.keys(), "material": self.material()}
-        return validate(raw, SpecimenTable, "scene", "[specimen]").specimen()
+        return validate(raw, SpecimenTable, "scene", "scene.toml, not yet written").specimen()
 
 
 @dataclass(frozen=True)
@@ -97,17 +97,23 @@ def extent(film: Film) -> Extent:
     deepest = rounded(DEPTH * (film.ring_radius_mm - film.disk_radius_mm))
     h = np.linspace(0.02, 1.0, 12) * deepest * 1e-3
     volts = np.array([0.0, *np.geomspace(100.0, SUPPLY_V, 40)])
-    found = solve_many(specimen, h[None, :], volts[:, None])
-    good = np.all(_good(found, film.preset.breakdown_V_per_um * FIELD_PART * 1e6), axis=1)
-    if not good[0]:
+    strongest = film.preset.breakdown_V_per_um * FIELD_PART * 1e6
+    rest = solve_many(specimen, h, 0.0)
+    if not _good(rest, strongest).all():
         raise ConfigError(
             f"With these dimensions the model has no taut film from 0 to {deepest:g} mm even without voltage. "
             "Check radii, thickness and pre-stretch."
         )
-    last = int(np.argmin(good)) - 1 if not good.all() else len(volts) - 1
+    last, too_high = 0, len(volts)  # by halves: a voltage that no film bears takes longest to answer
+    while too_high - last > 1:
+        middle = (last + too_high) // 2
+        if _good(solve_many(specimen, h, volts[middle]), strongest).all():
+            last = middle
+        else:
+            too_high = middle
     voltage = rounded(volts[last], down=True)
     at = solve_many(specimen, h, voltage)
-    force = float(np.abs(np.concatenate([at.force, found.force[0]])).max())
+    force = float(np.abs(np.concatenate([at.force, rest.force])).max())
     cell = next((size for size in CELLS_N if size >= 1.4 * force), None)
     if cell is None:
         raise ConfigError(f"The model expects {force:.3g} N at {deepest:g} mm; no usual load cell bears that.")

@@ -16,8 +16,8 @@ from pydantic.fields import FieldInfo
 from rig.base.errors import ConfigError
 
 EPSILON_0 = 8.8541878188e-12  # F/m
-PREFIXES = {"n": -9, "u": -6, "m": -3, "": 0, "k": 3, "M": 6}
-UNITS = {"m": "num ", "N": "m ", "Pa": " kM", "V": " k", "A": "num ", "s": "um ", "Hz": " k", "J": "um ", "g": "m k"}
+PREFIXES = {"p": -12, "n": -9, "u": -6, "m": -3, "": 0, "k": 3, "M": 6}
+UNITS = {"m": "num ", "N": "um ", "Pa": " kM", "V": "m k", "A": "pnum ", "s": "um ", "Hz": " k", "J": "um ", "g": "m k"}
 _UNIT = re.compile(r"_(?P<prefix>[numkM]?)(?P<unit>Pa|Hz|[mNVAsJg])(?:_per_(?P<below>[a-zA-Z0-9]+))?$")
 
 
@@ -72,7 +72,7 @@ def _within(value: float, usual: tuple[float, float]) -> bool:
 
 
 def slip(key: str, value: float, usual: tuple[float, float]) -> str:
-    """What was probably meant: the value in another unit, or a percentage in place of a ratio."""
+    """What was probably meant: the value in another unit, a percentage in place of a ratio, or a decimal point."""
     if "stretch" in key:
         readings = [(f"{value:g} %", 1 + value / 100), (f"a strain of {value:g}", 1 + value)]
         for meant, ratio in reversed(readings) if value < 1 else readings:
@@ -83,7 +83,8 @@ def slip(key: str, value: float, usual: tuple[float, float]) -> str:
     for unit, factor in _other_units(key):
         if usual[0] <= value * factor <= usual[1]:
             return f"If {value:.10g} {unit} is meant, write {value * factor:.10g}."
-    return ""
+    without_point = [f"{value / part:.10g}" for part in (10, 100) if value > usual[1] >= value / part >= usual[0]]
+    return f"If the decimal point is missing, write {' or '.join(without_point)}." if without_point else ""
 
 
 def _other_units(key: str) -> list[tuple[str, float]]:
@@ -94,10 +95,9 @@ def _other_units(key: str) -> list[tuple[str, float]]:
     prefix, unit, below = found["prefix"], found["unit"], found["below"] or ""
     per = f"/{below}" if below else ""
     own = PREFIXES[prefix]
-    others = [(f"{p.strip()}{unit}{per}", PREFIXES[p.strip()] - own) for p in UNITS[unit] if p.strip() != prefix]
-    if below in ("um", "mm"):  # V/um thought in V/m
-        lengths = {"um": -6, "mm": -3, "m": 0}
-        others += [(f"{prefix}{unit}/{b}", lengths[below] - e) for b, e in lengths.items() if b != below]
+    lengths = {"um": -6, "mm": -3, "m": 0} if below in ("um", "mm") else {}  # V/um thought in V/m
+    others = [(f"{prefix}{unit}/{b}", lengths[below] - e) for b, e in lengths.items() if b != below]
+    others += [(f"{p.strip()}{unit}{per}", PREFIXES[p.strip()] - own) for p in UNITS[unit] if p.strip() != prefix]
     return [(name, 10.0**power) for name, power in sorted(others, key=lambda one: abs(one[1]))]
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rig.cli.files import FILE, tell_written
+from rig.cli.files import FILE, POSITIVE, tell_written
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -26,7 +26,7 @@ def command() -> None:
 @click.argument("files", type=FILE, nargs=-1, required=True)
 @click.option("-o", "--out", type=FILE, help="All numbers as JSON, in SI units.")
 @click.option("--plot", type=FILE, help="Probability plot, SVG or PNG.")
-@click.option("--area-mm2", type=click.FloatRange(min=0, min_open=True), help="Reference area. Absent: the mean.")
+@click.option("--area-mm2", type=POSITIVE, help="Reference area. Absent: the mean.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the simulated campaigns.")
 @click.option(
     "--simulated", type=click.IntRange(200, 20000), default=1000, show_default=True, help="Campaigns simulated."

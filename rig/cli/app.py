@@ -26,8 +26,8 @@ HELPERS = {  # modules of this package that are no commands
     "talk",
     "topics",
 }
-EXIT_CODES = """Exit codes: 0 done; 1 failed; 2 a file or option cannot be used, nothing was touched; 3 a limit;
-4 a fault of the rig; 130 stopped by the operator."""
+EXIT_CODES = """Exit codes: 0 done; 1 failed; 2 a file or option cannot be used, nothing was touched; 3 a limit, or a
+plan that cannot be carried out; 4 a fault of the rig; 130 stopped by the operator."""
 
 
 class Commands(click.Group):
@@ -43,6 +43,17 @@ class Commands(click.Group):
             return command
         entry = _others().get(cmd_name)
         return None if entry is None else _load(entry)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click does it; a mistyped name is answered with the nearest one."""
+        if args and not args[0].startswith("-") and args[0] not in (names := self.list_commands(ctx)):
+            from difflib import get_close_matches
+
+            near = get_close_matches(args[0], names, n=1, cutoff=0.6)
+            ctx.fail(f"There is no command '{args[0]}'." + (f" Did you mean '{near[0]}'?" if near else ""))
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """One line for each command. Ours stands at the top of its file, so that no command is imported for it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,33 @@ from typing import Any
 
 import click
 
+
+class Number(click.FloatRange):
+    """A finite number in the unit that the option's name says, within a range."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        text = str(value).strip()
+        try:
+            finite = abs(float(text)) < float("inf")
+        except ValueError:
+            finite = False
+        if not finite:
+            self.fail(f"'{text}': {_number_said(text)}", param, ctx)
+        return super().convert(float(text), param, ctx)
+
+
+def _number_said(text: str) -> str:
+    """What is wrong with a text that should be a number."""
+    found = re.fullmatch(r"([-+]?\d+)(?:([.,])(\d+))?\s*([^\d.,]*)", text)
+    if found is None or not (found[4] or found[2] == ","):
+        return "a finite number is needed here, for example 4.5."
+    why = "Decimals take a point, not a comma" if found[2] == "," else "The option's name says the unit"
+    return f"a number is needed here. {why}: {found[1]}{f'.{found[3]}' if found[3] else ''}."
+
+
+POSITIVE = Number(min=0, min_open=True)
 FILE = click.Path(path_type=Path, dir_okay=False)
 FILE_OR_STDIN = click.Path(path_type=Path, dir_okay=False, allow_dash=True)
 FOLDER = click.Path(path_type=Path, file_okay=False)

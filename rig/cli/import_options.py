@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import click
 
-from rig.cli.files import FILE
+from rig.cli.files import FILE, POSITIVE
 
 if TYPE_CHECKING:
     from rig.importing.options import ImportOptions
@@ -26,8 +26,8 @@ PAIRS = (
 )
 SHEET_ONLY = (
     click.option("--kind", metavar="KIND", help="Kind of test: uniaxial, equibiaxial, 'pure shear' or biaxial."),
-    click.option("--area-mm2", type=click.FloatRange(min=0, min_open=True), help="Cross-section, unstretched."),
-    click.option("--length-mm", type=click.FloatRange(min=0, min_open=True), help="Length, unstretched."),
+    click.option("--area-mm2", type=POSITIVE, help="Cross-section, unstretched."),
+    click.option("--length-mm", type=POSITIVE, help="Length, unstretched."),
 )
 CONE_ONLY = (click.option("--voltage", metavar="V,V,...", help="Voltage of each sweep in turn, or one for all."),)
 COMMON = (

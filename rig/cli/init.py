@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from rig.cli.files import FOLDER
+from rig.cli.files import FOLDER, POSITIVE, Number
 
 if TYPE_CHECKING:
     from rig.analysis.first_bench import Film
-
-RADIUS = click.FloatRange(min=0, min_open=True)
 
 
 @click.command("init")
 @click.argument("folder", type=FOLDER)
 @click.option("--preset", help="The film: parker, vhb-4905, vhb-4910, elastosil-2030, ecoflex-00-30, sylgard-184.")
-@click.option("--disk-radius-mm", type=RADIUS, help="Radius of the disk.")
-@click.option("--ring-radius-mm", type=RADIUS, help="Inner radius of the ring.")
-@click.option("--prestretch", type=click.FloatRange(1, 6), help="Stretched over original length; 1 is none.")
-@click.option("--thickness-um", type=RADIUS, help="Of the film before pre-stretch; default: as sold.")
+@click.option("--disk-radius-mm", type=POSITIVE, help="Radius of the disk.")
+@click.option("--ring-radius-mm", type=POSITIVE, help="Inner radius of the ring.")
+@click.option("--prestretch", type=Number(), help="Stretched over original length; 1 is none.")
+@click.option("--thickness-um", type=POSITIVE, help="Of the film before pre-stretch; default: as sold.")
 @click.option("--name", default="film-1", show_default=True, help="Of this specimen.")
 @click.option("--no-hv", is_flag=True, help="A bench without high voltage.")
 @click.option("--no-laser", is_flag=True, help="A bench without a displacement sensor.")
@@ -60,7 +59,9 @@ def command(
     if preset is None:
         preset = "parker" if yes else click.prompt("Film", type=click.Choice(list(PRESETS)), default="parker")
     if preset not in PRESETS:
-        raise ConfigError(f"--preset {preset}: there is no such film; there are {', '.join(PRESETS)}.")
+        near = get_close_matches(preset, list(PRESETS), n=1, cutoff=0.5)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"--preset {preset}: there is no such film; there are {', '.join(PRESETS)}.{hint}")
     known = PRESETS[preset]
     film = Film(
         preset=known,
@@ -70,6 +71,7 @@ def command(
         thickness_um=asked("Thickness before pre-stretch / um", thickness_um, known.thicknesses_um[0]),
         prestretch=asked("Pre-stretch, 1 is none", prestretch, known.prestretch),
     )
+    _check(film)
     made = _write(film, folder, hv=not no_hv, displacement=not no_laser)
     for path in made:
         click.echo(f"written: {path}")
@@ -79,6 +81,26 @@ def command(
     click.echo(f"  dea-rig check {scene} {sweep}")
     click.echo(f"  dea-rig run {scene} {sweep} -o {log}")
     click.echo(f"  dea-rig fit {log} -o {folder / 'fit.json'} --report {folder / 'report.html'}")
+
+
+def _check(film: Film) -> None:
+    """Dimensions that are hardly meant are told as the options that they came by."""
+    from rig.base.errors import ConfigError
+    from rig.base.unusual import slip_of, usual_of
+    from rig.scene.specimen import SpecimenTable
+
+    for key in ("disk_radius_mm", "ring_radius_mm", "thickness_um", "prestretch"):
+        value, usual = getattr(film, key), usual_of(SpecimenTable.model_fields[key])
+        if usual is not None and not usual[0] <= value <= usual[1]:
+            raise ConfigError(
+                f"--{key.replace('_', '-')} {value:g}: usual are {usual[0]:g} to {usual[1]:g}. "
+                f"{slip_of(SpecimenTable, key, value)}".rstrip()
+            )
+    if not film.disk_radius_mm < film.ring_radius_mm:
+        raise ConfigError(
+            f"--disk-radius-mm {film.disk_radius_mm:g} and --ring-radius-mm {film.ring_radius_mm:g}: the disk must be "
+            "smaller than the ring. Were the two swapped?"
+        )
 
 
 def _write(film: Film, folder: Path, *, hv: bool, displacement: bool) -> list[Path]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rig.cli.files import FILE, nothing_without_a_log
+from rig.cli.files import FILE, POSITIVE, nothing_without_a_log
 
 if TYPE_CHECKING:
     from rig.analysis.sensors import Quantity
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @click.command("verify")
 @click.argument("quantity", type=click.Choice(["force", "displacement", "hv"]))
 @click.argument("scene", type=FILE)
-@click.option("--standard", type=click.FloatRange(min=0, min_open=True), required=True, help="In g, mm or V.")
+@click.option("--standard", type=POSITIVE, required=True, help="In g, mm or V.")
 @click.option("-o", "--out", type=FILE, required=True, help="Log to write; never overwrites.")
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports (hv only).")
 @click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")

@@ -70,6 +70,8 @@ def read_text(path: Path, encoding: str | None = None) -> TableText:
             )
         with path.open("rb") as file:
             raw = file.read(LARGEST_BYTES + 1)
+    except FileNotFoundError:
+        raise _refused(path, "there is no such file; check the name") from None
     except OSError as error:
         raise _refused(path, f"cannot be read: {error.strerror}") from None
     for magic, what, remedy in BINARY:

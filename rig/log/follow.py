@@ -13,7 +13,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 
 from rig.log.container import MAGIC
-from rig.log.errors import LogError
+from rig.log.errors import UnusableFile
 from rig.log.reader import Columns, tables_of
 from rig.log.scan import MAX_CHUNK, ChannelInfo, Damaged, Scan, Source, chunk_content
 
@@ -25,13 +25,13 @@ def growing(path: Path) -> Path:
 
     Raises
     ------
-    LogError
+    UnusableFile
         Neither exists.
     """
     part = path.with_name(path.name + ".part")
     if path.exists() or not part.exists():
         if not path.exists():
-            raise LogError(path, "there is no such file", "Check the name.")
+            raise UnusableFile(path, "there is no such file", "Check the name.")
         return path
     return part
 

@@ -92,6 +92,8 @@ def _check_log(log: Path) -> None:
     try:
         with path.open("rb") as file:
             is_log = file.read(len(MAGIC)) == MAGIC
+    except FileNotFoundError:
+        raise UnusableFile(path, "there is no such file", "Check the name.") from None
     except OSError as error:
         raise UnusableFile(path, f"cannot be read: {error.strerror}") from None
     if not is_log:

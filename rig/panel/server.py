@@ -22,6 +22,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from rig.base.errors import RigError
+from rig.log.follow import growing
 from rig.operator.live import live_runs
 from rig.panel.run_view import RunView
 
@@ -48,6 +49,8 @@ class Panel(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, log: Path | None, port: int = 0) -> None:
+        if log is not None:
+            growing(log)  # before a port is taken
         super().__init__(("127.0.0.1", port), _Handler)
         self.token = secrets.token_urlsafe(24)
         self._log = None if log is None else log.resolve()

@@ -85,10 +85,13 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
         scene = scene.with_ports(ports)
     protocol, protocol_text = load_protocol(protocol_path)
     certificates = certificates_of(scene, scene_path)
-    actions = plan(protocol, scene)
     force = certificates.get("force")
-    predictions = check_plan(actions, scene, 0.0 if force is None else force.noise)
-    _check_ranges(certificates, actions, predictions)
+    try:
+        actions = plan(protocol, scene)
+        predictions = check_plan(actions, scene, 0.0 if force is None else force.noise)
+        _check_ranges(certificates, actions, predictions)
+    except (ConfigError, LimitError) as error:
+        raise type(error)(f"{protocol_path} on {scene_path}: {error}", device=error.device, cause=error.cause) from None
     _check_limits(scene, scene_path, certificates, actions)
     served = ports is not None and are_served(ports)
     return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions, served=served)

@@ -46,23 +46,23 @@ class MaterialTable(Table):
 
     @model_validator(mode="after")
     def _is_a_film(self) -> Self:
-        self.material("here")  # whatever the model refuses
+        self.material("")  # whatever the model refuses
         return self
 
     def unusual(self) -> Iterator[tuple[str, str]]:
         """What is hardly meant of its law: see `rig.base.unusual`."""
         law, values = law_values(self)
-        modulus = self.material("here").shear_modulus
+        modulus = self.material("").shear_modulus
         keys = {p.name: p.key for p in law.parameters(*law.counts(1))}
         if not _usual(modulus):
             moduli = " and ".join(f"{key} = {getattr(self, key)}" for key in keys.values() if key.endswith("_Pa"))
-            units = {"kPa": 1e3, "MPa": 1e6, "mPa": 1e-3, "uPa": 1e-6}
+            units = {"kPa": 1e3, "MPa": 1e6}
             meant = next((unit for unit, factor in units.items() if _usual(modulus * factor)), "")
-            hint = f" Are they in {meant}? They belong in Pa: 33e3 for 33 kPa." if meant else ""
+            hint = (f"Are they in {meant}? " if meant else "") + "They belong in Pa: 33e3 for 33 kPa."
             yield (
                 "shear_modulus",
                 f"{moduli}: the shear modulus at small strain is then {modulus:.4g} Pa; usual are "
-                f"{USUAL_MODULUS_PA[0]:g} to {USUAL_MODULUS_PA[1]:g} Pa.{hint}",
+                f"{USUAL_MODULUS_PA[0]:g} to {USUAL_MODULUS_PA[1]:g} Pa. {hint}",
             )
         if {"mu", "alpha"} <= values.keys():
             yield from self._falling_terms(values)
@@ -168,7 +168,17 @@ class SpecimenTable(Table):
             raise ValueError("eccentricity_mm must be smaller than the gap between disk and ring")
         if isinstance(self.material, str) and self.material not in NAMED:
             raise ValueError(f"material {self.material!r} is not known; known are {', '.join(sorted(NAMED))}")
+        self._stands_its_prestretch()
         return self
+
+    def _stands_its_prestretch(self) -> None:
+        known = self.material
+        largest = NAMED[known].max_stretch if isinstance(known, str) else known.max_stretch
+        if largest is not None and not self.prestretch < largest:
+            raise ValueError(
+                f"prestretch = {self.prestretch:g}, but the material's max_stretch, pre-stretch included, is "
+                f"{largest:g}: the film would tear when it is mounted"
+            )
 
     def _disk_in_ring(self) -> str:
         """What is wrong when the disk does not fit into the ring, and what was probably meant."""

@@ -73,10 +73,15 @@ def test_without_options_it_asks(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--preset", "vhb4905"), "vhb-4905"),
-        (("--disk-radius-mm", "30"), "smaller than ring_radius_mm"),
+        (("--preset", "vhb4905"), "Did you mean vhb-4905?"),
+        (("--disk-radius-mm", "30"), "--disk-radius-mm 30 and --ring-radius-mm 25"),
+        (("--disk-radius-mm", "5000"), "--disk-radius-mm 5000: usual are 0.2 to 100. If 5000 um is meant, write 5."),
+        (("--disk-radius-mm", "5mm"), "The option's name says the unit: 5."),
+        (("--prestretch", "300"), "--prestretch 300: usual are 1 to 6. If 300 % is meant, write 4."),
+        (("--prestretch", "1,2"), "Decimals take a point, not a comma: 1.2."),
+        (("--prestretch", "nan"), "a finite number"),
         (("--name", "a/b"), "not allowed"),
-        (("--thickness-um", "0.04"), "hardly meant"),
+        (("--thickness-um", "0.04"), "--thickness-um 0.04: usual are 1 to 5000. If 0.04 mm is meant, write 40."),
     ],
 )
 def test_what_cannot_be_leaves_nothing(tmp_path: Path, options: tuple[str, ...], words: str) -> None:

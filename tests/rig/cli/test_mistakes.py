@@ -68,8 +68,25 @@ SCENES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "moduli in kPa": ("[33e3, 32e3]", "[33, 32]", ("mu_Pa", "shear modulus", "113 Pa", "in kPa", "33e3 for 33 kPa")),
     "moduli in MPa": ("[33e3, 32e3]", "[0.033, 0.032]", ("mu_Pa", "0.113 Pa", "in MPa")),
     "one negative modulus": ("[33e3, 32e3]", "[33e3, -2e3]", ("mu_Pa 2 = -2000", "same sign")),
-    "permittivity, no point": ("eps_r = 1.9", "eps_r = 190", ("eps_r = 190", "usual are 1 to 50")),
+    "permittivity, no point": (
+        "eps_r = 1.9",
+        "eps_r = 190",
+        ("eps_r = 190", "usual are 1 to 50", "decimal point is missing, write 19 or 1.9."),
+    ),
     "permittivity in F/m": ("eps_r = 1.9", "eps_r = 2.5e-11", ("eps_r = 2.5e-11", "write 2.82")),
+    "a pre-stretch beyond the film": (
+        "max_stretch = 2.4",
+        "max_stretch = 1.1",
+        ("prestretch = 1.2", "max_stretch", "1.1"),
+    ),
+    "an exponent of zero": ("[2.0, 5.0]", "[0, 5.0]", ("specimen, material: alpha = (0.0, 5.0)", "exponent of zero")),
+    "disk and ring swapped": (
+        "disk_radius_mm = 4.0\nring_radius_mm = 20.0",
+        "disk_radius_mm = 20.0\nring_radius_mm = 4.0",
+        ("disk_radius_mm = 20 and ring_radius_mm = 4", "Were the two swapped?"),
+    ),
+    "no limits": (SCENE[SCENE.index("[limits]") : SCENE.index("[stage]")], "", ("limits: this table is missing",)),
+    "a table twice": ("gain_error = 5e-4", 'gain_error = 5e-4\n[hv]\ndriver = "x"', ("[hv]", "given twice")),
     "pre-stretch in percent": ("prestretch = 1.2", "prestretch = 20", ("at most 6", "20 % is meant, write 1.2")),
     "pre-stretch as strain": (
         "prestretch = 1.2",
@@ -81,6 +98,9 @@ SCENES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "voltage in kV": ("voltage_V = 1800.0", "voltage_V = 1.8", ("voltage_V = 1.8", "1.8 kV is meant, write 1800")),
     "field in V/m": ("field_V_per_um = 80.0", "field_V_per_um = 80e6", ("80000000 V/m is meant, write 80",)),
     "field in V/mm": ("field_V_per_um = 80.0", "field_V_per_um = 80e3", ("80000 V/mm is meant, write 80",)),
+    "current in pA": ("current_uA = 50.0", "current_uA = 50000000", ("50000000 pA is meant, write 50",)),
+    "ramp in mV": ("ramp_V_per_s = 300.0", "ramp_V_per_s = 300000", ("300000 mV/s is meant, write 300",)),
+    "approach without point": ("approach_from_mm = 36.0", "approach_from_mm = 360", ("is missing, write 36 or 3.6",)),
     "current in A": ("current_uA = 50.0", "current_uA = 5e-5", ("current_uA", "A is meant, write 50")),
     "approach in um": ("approach_from_mm = 36.0", "approach_from_mm = 36000", ("36000 um is meant, write 36",)),
     "a key of another unit": (
@@ -157,6 +177,87 @@ def test_a_slip_in_a_protocol(bench: Path, slip_of_hand: str) -> None:
     (bench / "mine.toml").write_text(replaced(PROTOCOL, old, new))
     done = say("check", "s.toml", "mine.toml")
     told(done, 2, "mine.toml", *words)
+
+
+UNCARRIED: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "no home": ('[[step]]\ndo = "home"\n', "", ("mine.toml on s.toml: Step 2 (approach) needs a home",)),
+    "no approach": (
+        PROTOCOL[PROTOCOL.index('[[step]]\ndo = "approach"') : PROTOCOL.index('[[step]]\ndo = "sweep"')],
+        "",
+        ("mine.toml on s.toml: Step 3 (sweep) needs the contact position: put an approach step before it.",),
+    ),
+    "too far": ("displacement_mm = 6.0", "displacement_mm = 60.0", ("displacement 60 mm", "at most 14 mm")),
+    "too high": ("[0, 800]", "[0, 8000]", ("mine.toml on s.toml: Step 4", "8000 V", "0 to 1800 V")),
+}
+
+
+@pytest.mark.parametrize("slip_of_hand", UNCARRIED)
+def test_a_plan_that_cannot_be_carried_out(bench: Path, slip_of_hand: str) -> None:
+    old, new, words = UNCARRIED[slip_of_hand]
+    (bench / "mine.toml").write_text(replaced(PROTOCOL, old, new))
+    before = sorted(bench.iterdir())
+    told(say("run", "s.toml", "mine.toml", "-o", "x.mcap"), 3, *words)
+    assert sorted(bench.iterdir()) == before
+
+
+LOG = next(FIXTURES.glob("logs/*/log.mcap"))
+COMMANDS: dict[str, tuple[int, str]] = {
+    "chekc s.toml p.toml": (2, "no command 'chekc'. Did you mean 'check'?"),
+    "check s.toml": (2, "Missing argument 'PROTOCOL'"),
+    "check cal p.toml": (2, "File 'cal' is a directory"),
+    "check p.toml s.toml": (2, "wrong order"),
+    "run s.toml p.toml": (2, "Missing option '-o'"),
+    "run s.toml p.toml -o cal": (2, "File 'cal' is a directory"),
+    "run s.toml p.toml -o none/x.mcap": (2, "none/x.mcap: its folder none does not exist"),
+    "run s.toml p.toml -o s.toml": (2, "s.toml: exists already; nothing is overwritten"),
+    "run s.toml p.toml --output x.mcap": (2, "Did you mean '--out'?"),
+    "run s.toml p.toml -o x.mcap --ports s.toml": (2, "not a JSON file of ports"),
+    "fit p.toml": (2, "p.toml: not a log of this program"),
+    "fit none.mcap": (2, "none.mcap: there is no such file"),
+    "plan s.toml --time 10": (2, "with its unit: 10min, 300s or 1.5h"),
+    "plan s.toml --time 1,5h": (2, "with its unit: 10min, 300s or 1.5h"),
+    "verify force s.toml --standard 20g -o y.mcap": (
+        2,
+        "'20g': a number is needed here. The option's name says the unit: 20",
+    ),
+    "verify force s.toml --standard 1,5 -o y.mcap": (2, "Decimals take a point, not a comma: 1.5."),
+    "verify force s.toml --standard nan -o y.mcap": (2, "a finite number is needed here"),
+    "verify force s.toml --standard 0 -o y.mcap": (2, "not in the range x>0"),
+    "verify force s.toml --standard 2000 -o y.mcap": (3, "2000 g pull with 19.6 N, and limits.force_N is less"),
+    "calibrate force s.toml": (2, "Missing option '-o'"),
+    "watch none.mcap": (2, "none.mcap: there is no such file"),
+    "watch --terminal none.mcap": (2, "none.mcap: there is no such file"),
+    "note none.mcap scratch": (2, "none.mcap: there is no such file"),
+    "note s.toml scratch": (2, "s.toml: is not a log"),
+    "runs none": (2, "none: there is no such folder"),
+    "info none.mcap": (2, "none.mcap: there is no such file"),
+    "view none.mcap": (2, "none.mcap: there is no such file"),
+    "replay s.toml": (2, "s.toml: is not a log"),
+    "resume none.mcap -o r.mcap": (2, "none.mcap: there is no such file"),
+    "recover s.toml -o r.mcap": (2, "s.toml: is not a log"),
+    f"recover {LOG} -o s.toml": (2, "s.toml: exists already"),
+    f"export {LOG} -o x.xlsx": (2, "Allowed: .csv and .parquet"),
+    f"stroke {LOG}": (1, "holds no follow step"),
+    "fit-tests none.csv": (2, "none.csv: there is no such file"),
+    "solve s.toml": (2, "not a JSON file of cases"),
+    "keys sweeep": (2, "Did you mean sweep?"),
+    "sim p.toml": (2, "this is a protocol file, not a scene file"),
+    "design none.toml": (2, "none.toml: there is no such study file"),
+    "stop": (2, "No run of yours is going on. Nothing was done."),
+    "pause none.mcap": (2, "No run of yours is going on that writes none.mcap"),
+    "init s.toml": (2, "Directory 's.toml' is a file"),
+}
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_a_slip_in_a_command(
+    bench: Path, line: str, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    code, words = COMMANDS[line]
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("live")))
+    before = sorted(bench.rglob("*"))
+    told(say(*line.split()), code, words)
+    assert sorted(bench.rglob("*")) == before
 
 
 def test_a_step_lists_its_own_keys_only(bench: Path) -> None:
