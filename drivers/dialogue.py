@@ -17,6 +17,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+from drivers.heard import Heard
 from drivers.links.link import ByteLink, DeviceSilent, FrameLink
 
 Q = TypeVar("Q")
@@ -39,13 +40,15 @@ class Ask(Generic[Q]):
     """One request.
 
     ``repeat`` says that sending it twice does no harm: only then is it retried. ``timeout_s`` overrides the
-    dialogue's own. It is sent ``delay_s`` after the step before it.
+    dialogue's own. It is sent ``delay_s`` after the step before it. For ``boot_s`` it is sent again and again, to a
+    device that may still be starting.
     """
 
     request: Q
     repeat: bool = True
     timeout_s: float | None = None
     delay_s: float = 0.0
+    boot_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +101,7 @@ class _Outstanding(Generic[Q, R]):
     sent: float
     deadline: float
     tries_left: int
+    boots_until: float
 
 
 class Dialogue(Generic[Q, R]):
@@ -121,6 +125,8 @@ class Dialogue(Generic[Q, R]):
         Says a request in words for the error message.
     advice : str
         What the operator should do when the device is silent.
+    heard : Heard, optional
+        What the device has read; told when an answer is missing.
 
     A request that stays unanswered throws `DeviceSilent` into its script, which may catch it (to ask for the state
     before a motion command is repeated, say); if it does not, the error leaves through `run`. A script that ends in
@@ -137,6 +143,7 @@ class Dialogue(Generic[Q, R]):
         retries: int = 2,
         describe: Callable[[Q], str] = str,
         advice: str = "Check that it is switched on, its cable, and the baud rate.",
+        heard: Heard | None = None,
     ) -> None:
         self._device = device
         self._transmit = send
@@ -145,6 +152,7 @@ class Dialogue(Generic[Q, R]):
         self._retries = retries
         self._describe = describe
         self._advice = advice
+        self._heard = heard or Heard()
         self._queue: deque[Script[Q, R]] = deque()
         self._script: Script[Q, R] | None = None
         self._delayed: tuple[float, Ask[Q]] | None = None
@@ -182,6 +190,7 @@ class Dialogue(Generic[Q, R]):
         if out is None or not out.answers(message):
             return False
         self._outstanding = None
+        self._heard.clear()
         round_trip_us = round((now - out.sent) * 1e6)
         self._counters["round_trips"] += 1
         self._counters["round_trip_sum_us"] += round_trip_us
@@ -195,16 +204,19 @@ class Dialogue(Generic[Q, R]):
         out = self._outstanding
         if out is not None and now >= out.deadline:
             self._outstanding = None
-            if out.tries_left > 0:
+            if out.tries_left > 0 or now < out.boots_until:
                 self._counters["retries"] += 1
-                self._send(out.ask, out.tries_left - 1, now)
+                self._send(out.ask, max(0, out.tries_left - 1), now, out.boots_until)
             else:
                 self._counters["unanswered"] += 1
-                silent = DeviceSilent(self._device, f"no answer to {self._describe(out.ask.request)!r}", self._advice)
+                waited = f" within {out.ask.boot_s:g} s" if out.ask.boot_s else ""
+                what = f"no answer to {self._describe(out.ask.request)!r}{waited}{self._heard}"
+                self._heard.clear()
+                silent = DeviceSilent(self._device, what, self._advice)
                 self._step(lambda script: script.throw(silent), now)
         if self._delayed is not None and now >= self._delayed[0]:
             ask, self._delayed = self._delayed[1], None
-            self._send(ask, self._retries if ask.repeat else 0, now)
+            self._send(ask, self._retries if ask.repeat else 0, now, now + ask.boot_s)
         while self._script is None and self._queue:
             self._script = self._queue.popleft()
             self._step(next, now)
@@ -221,13 +233,13 @@ class Dialogue(Generic[Q, R]):
         if ask.delay_s > 0:
             self._delayed = (now + ask.delay_s, ask)
         else:
-            self._send(ask, self._retries if ask.repeat else 0, now)
+            self._send(ask, self._retries if ask.repeat else 0, now, now + ask.boot_s)
 
-    def _send(self, ask: Ask[Q], tries_left: int, now: float) -> None:
+    def _send(self, ask: Ask[Q], tries_left: int, now: float, boots_until: float) -> None:
         try:
             answers = self._transmit(ask.request)
         except BaseException:
             self._script = None
             raise
         timeout_s = self._timeout_s if ask.timeout_s is None else ask.timeout_s
-        self._outstanding = _Outstanding(ask, answers, now, now + timeout_s, tries_left)
+        self._outstanding = _Outstanding(ask, answers, now, now + timeout_s, tries_left, boots_until)

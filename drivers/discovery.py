@@ -127,9 +127,9 @@ def discover(
 
 
 def _open_port(port: str, baud: int) -> ByteLink:
-    from drivers.links.serial_link import SerialLink
+    from drivers.links.device_server import open_line
 
-    return SerialLink("devices", port, baud)
+    return open_line("devices", port, baud)
 
 
 def _open_bus(bus: Bus) -> FrameLink:

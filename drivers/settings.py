@@ -45,6 +45,12 @@ class InstrumentSettings(Table):
         le=10,
         description="How long to wait for each answer (s). Typical: 0.1 to 0.5.",
     )
+    boot_s: float = Field(
+        default=10.0,
+        ge=0,
+        le=60,
+        description="How long it may take to start (s): for so long its first answer is waited for. Typical: 2 to 10.",
+    )
     serial: str | None = Field(
         default=None,
         description="Serial number that it must state, else the run is refused. Absent: any.",
@@ -90,15 +96,16 @@ class SerialSettings(InstrumentSettings):
     port: str | None = Field(
         default=None,
         min_length=1,
-        description='Serial port, e.g. "/dev/ttyUSB0" or "COM3"; `dea-rig devices` lists them. Absent: simulated.',
+        description='Serial port, e.g. "/dev/ttyUSB0" or "COM3" (`dea-rig devices` lists them), or a device server, '
+        '"socket://HOST:PORT" or "rfc2217://HOST:PORT". Absent: simulated.',
     )
     baud: int = Field(default=115_200, gt=0, description="Line rate (bit/s), as set in the instrument.")
 
     def open(self, name: str, adopt: Sequence[int] = ()) -> ByteLink:
-        from drivers.links.serial_link import SerialLink
+        from drivers.links.device_server import open_line
 
         assert self.port is not None
-        return SerialLink(name, self.port, self.baud, adopt=adopt)
+        return open_line(name, self.port, self.baud, adopt=adopt)
 
 
 class CanSettings(InstrumentSettings):
@@ -106,9 +113,11 @@ class CanSettings(InstrumentSettings):
 
     place_keys: ClassVar[tuple[str, ...]] = ("interface", "can_channel")
 
-    interface: Literal["slcan", "socketcan", "pcan", "vector", "virtual", "udp_multicast"] | None = Field(
+    interface: (
+        Literal["slcan", "socketcan", "pcan", "vector", "kvaser", "ixxat", "gs_usb", "virtual", "udp_multicast"] | None
+    ) = Field(
         default=None,
-        description="Kind of CAN adapter, as python-can names it. Absent: simulated.",
+        description="Kind of CAN adapter, as python-can names it; gs_usb is candleLight. Absent: simulated.",
     )
     can_channel: str | None = Field(
         default=None,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Generic, TypeVar
 
+from drivers.heard import Heard
 from drivers.links.link import DeviceRefused, DeviceSilent
 from drivers.roles import DisplacementSample, ForceSample
 from drivers.sample_clock import SampleClock
@@ -31,11 +32,24 @@ class Stream(Generic[S]):
         Longest time between two polls.
     counters : dict
         The device's; `SampleClock` counts in them.
+    heard : Heard, optional
+        What the device has read; told when nothing valid came.
+    boot_s : float
+        How long the first valid value may take.
     """
 
     def __init__(
-        self, device: str, rate_Hz: float, timeout_s: float, poll_interval_s: float, counters: dict[str, int]
+        self,
+        device: str,
+        rate_Hz: float,
+        timeout_s: float,
+        poll_interval_s: float,
+        counters: dict[str, int],
+        heard: Heard | None = None,
+        boot_s: float = 0.0,
     ) -> None:
+        self._came = heard or Heard()
+        self._boot_s = boot_s
         self._device = device
         self._rate = rate_Hz
         self._silence_limit_s = max(timeout_s, 5.0 / rate_Hz)
@@ -66,13 +80,16 @@ class Stream(Generic[S]):
         self._heard = min(self._heard, now)
         stamped = self._clock.feed(now, list(arrived))
         if any(sample is not None for sample in arrived):
-            self._heard = now
-        elif now - self._heard > self._silence_limit_s:
-            silent_s, self._heard = now - self._heard, now
+            self._heard, self._boot_s = now, 0.0
+            self._came.clear()
+        elif now - self._heard > max(self._silence_limit_s, self._boot_s):
+            silent_s, self._heard, self._boot_s = now - self._heard, now, 0.0
+            came = str(self._came)
+            self._came.clear()
             self._clock.count_anew()  # what is missing has been told
             raise DeviceSilent(
                 self._device,
-                f"no valid value for {silent_s:.2f} s though the stream was started",
+                f"no valid value for {silent_s:.2f} s though the stream was started{came}",
                 "Check the instrument and its cable; it may have been switched off, stopped or reset.",
             )
         if (rate := self._clock.other_rate()) is not None:

@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Generic, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import Field, model_validator
 
 from drivers.dialogue import LOST_AGAIN_S, label
+from drivers.heard import Heard
 from drivers.instrument import Instrument
 from drivers.lines import LineSplitter
 from drivers.links.link import ByteLink, DeviceRefused, DeviceSilent
@@ -45,8 +46,8 @@ G_N = 9.80665e-3
 Separator = Literal[",", ";", "tab", "space"]
 ForceUnit = Literal["N", "mN", "gf", "kgf", "mV/V"]
 LengthUnit = Literal["m", "mm", "um"]
-NEWTONS: dict[ForceUnit, float] = {"N": 1.0, "mN": 1e-3, "gf": G_N, "kgf": 1e3 * G_N, "mV/V": 1.0}
-METRES: dict[LengthUnit, float] = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
+NEWTONS = {"N": 1.0, "mN": 1e-3, "gf": G_N, "kgf": 1e3 * G_N, "mV/V": 1.0}
+METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 
 # -- its keys in a scene -----------------------------------------------------------------------------------------------
 
@@ -178,27 +179,44 @@ S = TypeVar("S", ForceSample, DisplacementSample)
 class AsciiStream(Generic[S]):
     """A sensor whose lines are read; nothing is sent.
 
-    It is ``ready`` with the first line that is understood. ``scale`` is the SI value of a reading of 1 in its unit.
+    It is ``ready`` with the first line that is understood. ``units`` are the SI values of 1 in each unit, the usual
+    one first.
 
     Raises, in `poll`, `DeviceSilent` when nothing that can be believed has come for ``timeout_s`` (or five periods, or
     ``boot_s`` at the start), telling what was dropped, and `DeviceRefused` when lines come at quite another rate.
     """
 
+    units: ClassVar[Mapping[str, float]]
+
     def __init__(
-        self, name: str, link: ByteLink, codec: Codec, rate_Hz: float, scale: float, limit: float, silence_s: float
+        self,
+        name: str,
+        link: ByteLink,
+        *,
+        unit: str = "",
+        factor: float = 1.0,
+        limit: float = 1e4,
+        separator: Separator = ",",
+        columns: int = 1,
+        column: int = 1,
+        rate_Hz: float = 80.0,
+        boot_s: float = 3.0,
+        timeout_s: float = 0.25,
     ) -> None:
         self.name = name
         self.identity = Identity()
-        self.settings: dict[str, str] = {}
-        self.counters = codec.counters
+        self.counters: dict[str, int] = {}
+        self._codec = Codec(separator, columns, column, self.counters)
         self.counters |= {"bad_values": 0, "no_value": 0}
         self._label = label(name, link)
         self._link = link
-        self._codec = codec
+        self._heard_bytes = Heard()
         self._rate = rate_Hz
-        self._scale, self._limit = scale, limit
-        self._longest_silence = silence_s
-        self._boot_s = 0.0
+        self._unit = unit or next(iter(self.units))
+        self._scale, self._limit = factor * self.units[self._unit], limit * self.units[self._unit]
+        self._longest_silence = max(timeout_s, 5.0 / rate_Hz)
+        self._boot_s = boot_s + self._longest_silence
+        self.settings: dict[str, str] = self._scale_in_words()
         self._heard: float | None = None
         self._ready = False
         self._last = -math.inf  # time of the last sample
@@ -223,7 +241,7 @@ class AsciiStream(Generic[S]):
 
     def poll(self, now: float) -> Sequence[S]:
         self._next_poll = now + LOST_AGAIN_S  # unless the port is there
-        data = self._link.read()
+        data = self._heard_bytes.bytes(self._link.read())
         self._next_poll = now + POLL_S
         if self._heard is None:
             self._heard = now
@@ -231,6 +249,7 @@ class AsciiStream(Generic[S]):
         samples = self._timed(values, now)
         if samples:
             self._heard, self._ready = now, True
+            self._heard_bytes.clear()
         elif now - self._heard > (self._longest_silence if self._ready else self._boot_s):
             self._silent(now, now - self._heard)
         self._check_rate(now, len(values))
@@ -252,10 +271,12 @@ class AsciiStream(Generic[S]):
         self._heard = now
         self._counted_since = math.inf
         dropped = {key: n for key, n in self.counters.items() if n}
+        came = str(self._heard_bytes)
+        self._heard_bytes.clear()
         told = ", ".join(f"{key} {n}" for key, n in dropped.items()) or "nothing came"
         raise DeviceSilent(
             self._label,
-            f"no valid value for {silent_s:.2f} s ({told})",
+            f"no valid value for {silent_s:.2f} s ({told}){came}",
             "Check its cable and the baud rate, and separator, columns, column and limit in the scene.",
         )
 
@@ -277,6 +298,9 @@ class AsciiStream(Generic[S]):
                 "Correct rate_Hz in the scene, or the rate in the instrument; or the line loses data.",
             )
 
+    def _scale_in_words(self) -> dict[str, str]:
+        raise NotImplementedError
+
     def _sample(self, t: float, value: float, flags: SampleFlag) -> S:
         raise NotImplementedError
 
@@ -284,27 +308,14 @@ class AsciiStream(Generic[S]):
 class AsciiForce(AsciiStream[ForceSample]):
     """A `drivers.roles.ForceSensor`, in newtons, or in mV/V where ``unit`` says so."""
 
-    def __init__(
-        self,
-        name: str,
-        link: ByteLink,
-        *,
-        unit: ForceUnit = "N",
-        factor: float = 1.0,
-        limit: float = 1e4,
-        separator: Separator = ",",
-        columns: int = 1,
-        column: int = 1,
-        rate_Hz: float = 80.0,
-        boot_s: float = 3.0,
-        timeout_s: float = 0.25,
-    ) -> None:
-        codec = Codec(separator, columns, column)
-        scale, most = factor * NEWTONS[unit], limit * NEWTONS[unit]
-        super().__init__(name, link, codec, rate_Hz, scale, most, max(timeout_s, 5.0 / rate_Hz))
-        self._boot_s = boot_s + self._longest_silence
-        self.reading_unit: str = "mV/V" if unit == "mV/V" else "N"
-        self.settings["reading_per_number"] = f"{scale:.9g} {self.reading_unit}"
+    units: ClassVar[Mapping[str, float]] = NEWTONS
+
+    @property
+    def reading_unit(self) -> str:
+        return "mV/V" if self._unit == "mV/V" else "N"
+
+    def _scale_in_words(self) -> dict[str, str]:
+        return {"reading_per_number": f"{self._scale:.9g} {self.reading_unit}"}
 
     def _sample(self, t: float, value: float, flags: SampleFlag) -> ForceSample:
         return ForceSample(t, value, flags)
@@ -313,26 +324,10 @@ class AsciiForce(AsciiStream[ForceSample]):
 class AsciiDisplacement(AsciiStream[DisplacementSample]):
     """A `drivers.roles.DisplacementSensor`."""
 
-    def __init__(
-        self,
-        name: str,
-        link: ByteLink,
-        *,
-        unit: LengthUnit = "mm",
-        factor: float = 1.0,
-        limit: float = 1e4,
-        separator: Separator = ",",
-        columns: int = 1,
-        column: int = 1,
-        rate_Hz: float = 80.0,
-        boot_s: float = 3.0,
-        timeout_s: float = 0.25,
-    ) -> None:
-        codec = Codec(separator, columns, column)
-        scale, most = factor * METRES[unit], limit * METRES[unit]
-        super().__init__(name, link, codec, rate_Hz, scale, most, max(timeout_s, 5.0 / rate_Hz))
-        self._boot_s = boot_s + self._longest_silence
-        self.settings["m_per_number"] = f"{scale:.9g}"
+    units: ClassVar[Mapping[str, float]] = METRES
+
+    def _scale_in_words(self) -> dict[str, str]:
+        return {"m_per_number": f"{self._scale:.9g}"}
 
     def _sample(self, t: float, value: float, flags: SampleFlag) -> DisplacementSample:
         return DisplacementSample(t, value, flags)

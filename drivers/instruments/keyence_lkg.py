@@ -33,6 +33,7 @@ from typing import Literal, NoReturn, TypeVar
 from pydantic import Field
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.heard import Heard
 from drivers.instrument import Instrument
 from drivers.lines import LineSplitter
 from drivers.links.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
@@ -64,6 +65,12 @@ LONGEST_SETTLING_S = 10.0
 """How long set-up waits for the first value; a specimen that the head cannot see never gives one."""
 
 SETTLING_LOOK_S = 0.01
+
+UNANSWERED = "not answered"
+"""What a setting is called that the controller does not know and says nothing to."""
+
+LATE_S = 0.25
+"""How long an answer may be late where no other question can show that it will not come any more."""
 
 MEASURE_TRIES = 3
 
@@ -220,6 +227,8 @@ class KeyenceLKG:
     limit_mm : float
         Largest magnitude that is believed. An LK-G152 sees +-40 mm; with zero or offset set the display may show
         twice that.
+    boot_s : float
+        How long the first answer may take.
     """
 
     def __init__(
@@ -232,6 +241,7 @@ class KeyenceLKG:
         timeout_s: float = 0.1,
         unit_mm: float = 1.0,
         limit_mm: float = 80.0,
+        boot_s: float = 0.0,
     ) -> None:
         if output not in (1, 2):
             raise ValueError(f"output must be 1 or 2, not {output!r}")
@@ -251,8 +261,11 @@ class KeyenceLKG:
         self._unit = unit_mm * 1e-3
         self._limit = limit_mm / unit_mm
         self._codec = Codec(self.counters)
+        self._boot_s = boot_s
+        self._heard = Heard()
+        self._states_program = True
         self._dialogue: Dialogue[str, Message] = Dialogue(
-            self._label, self._send, self.counters, timeout_s=timeout_s, retries=3
+            self._label, self._send, self.counters, timeout_s=timeout_s, retries=3, heard=self._heard
         )
         self._inbox: deque[Message] = deque()
         self._samples: list[DisplacementSample] = []
@@ -283,7 +296,7 @@ class KeyenceLKG:
     def poll(self, now: float) -> Sequence[DisplacementSample]:
         self._now = now
         try:
-            self._inbox.extend(self._codec.feed(self._link.read()))
+            self._inbox.extend(self._codec.feed(self._heard.bytes(self._link.read())))
             while self._inbox:
                 self._take(self._inbox.popleft(), now)
             if self._ready and self._dialogue.idle and self._schedule.take(now):
@@ -315,6 +328,9 @@ class KeyenceLKG:
             self.counters["pushed"] += 1
         elif isinstance(message, Measured) and self._implausible(message):
             self.counters["implausible"] += 1
+            self._heard.hint = (
+                f"a Keyence value beyond limit_mm = {self._limit * self._unit * 1e3:g} (a display in um?)"
+            )
         elif not self._dialogue.offer(message, now):
             self.counters["unexpected_replies"] += 1
 
@@ -334,13 +350,14 @@ class KeyenceLKG:
 
     def _set_up(self) -> Script[str, Message]:
         self._communicating = True
-        yield from self._enter("Q0")
+        yield from self._enter("Q0", self._boot_s)
         sampling = yield from self._setting("SR,CA")
         # Whether the kind of filter (0: average) belongs to the question is not known for every firmware.
         averaging = yield from self._setting(f"SR,OC,{self._output}", f"SR,OC,{self._output},0")
         yield from self._enter("R0")
         self._communicating = False
         program = yield from self._setting("PR")
+        self._states_program = program != UNANSWERED
         if sampling.isdecimal() and int(sampling) < len(SAMPLING_US):
             self._sampling_s = SAMPLING_US[int(sampling)] * 1e-6
         if averaging.isdecimal() and int(averaging) < len(AVERAGING):
@@ -361,17 +378,21 @@ class KeyenceLKG:
         self._schedule.start(self._now)
         self._ready = True
 
-    def _enter(self, mode: str) -> _Part[None]:
-        message = (yield Ask(mode)).message
+    def _enter(self, mode: str, boot_s: float = 0.0) -> _Part[None]:
+        message = (yield Ask(mode, boot_s=boot_s)).message
         # Status error: it is in that mode already, left so by another program or by the answer that was lost.
         if isinstance(message, Refused) and message.code != 1:
             self._refuse(mode, message)
 
     def _setting(self, *requests: str) -> _Part[str]:
-        """Last parameter of the first answer. A refusal is written down: measuring does not depend on it."""
+        """Last parameter of the first answer. Refusal and silence are written down: measuring does not need it."""
         refused = ""
         for request in requests:
-            message = (yield Ask(request)).message
+            try:
+                message = (yield Ask(request)).message
+            except DeviceSilent:  # a controller of another make or firmware may not know it, and says nothing
+                refused = refused or UNANSWERED
+                continue
             if isinstance(message, Response):
                 return message.text.rpartition(",")[2]
             assert isinstance(message, Refused)
@@ -404,7 +425,10 @@ class KeyenceLKG:
             except DeviceSilent:
                 # The answer may still come. Answers keep their order: after that to PR there is no old value left.
                 self.counters["retries"] += 1
-                yield Ask("PR")
+                if self._states_program:
+                    yield Ask("PR")
+                else:
+                    delay_s = LATE_S
         return (yield Ask(_MEASURE, repeat=False))
 
     def _refuse(self, command: str, refused: Refused) -> NoReturn:

@@ -27,6 +27,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from drivers.dialogue import LOST_AGAIN_S, label
+from drivers.heard import Heard
 from drivers.instrument import Instrument
 from drivers.links.link import ByteLink
 from drivers.recorded import Dialect
@@ -113,6 +114,7 @@ class OptoNCDT:
         first_error_word: int = 262_073,
         timeout_s: float = 0.25,
         poll_interval_s: float = 0.01,
+        boot_s: float = 0.0,
     ) -> None:
         self.name = name
         self.identity = Identity(model="optoNCDT 1420")
@@ -124,8 +126,9 @@ class OptoNCDT:
         self._sign = -1.0 if inverted else 1.0
         self._rate = rate_Hz
         self._first_error = first_error_word
+        self._heard = Heard()
         self._stream: Stream[DisplacementSample] = Stream(
-            label(name, link), rate_Hz, timeout_s, poll_interval_s, self.counters
+            label(name, link), rate_Hz, timeout_s, poll_interval_s, self.counters, self._heard, boot_s
         )
         self._fresh, self._ready = True, False
         self._next_poll = -math.inf
@@ -148,7 +151,7 @@ class OptoNCDT:
 
     def poll(self, now: float) -> Sequence[DisplacementSample]:
         self._next_poll = now + LOST_AGAIN_S  # unless the port is there
-        data = self._link.read()
+        data = self._heard.bytes(self._link.read())
         if self._fresh and data:  # begins anywhere in a triple; of what had piled up nobody knows the time
             self._fresh, data = False, b""
         self._next_poll = self._stream.next_poll(now)

@@ -30,6 +30,7 @@ from typing import ClassVar, Literal, TypeVar
 from pydantic import Field
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.heard import Heard
 from drivers.instrument import Instrument
 from drivers.lines import LineSplitter
 from drivers.links.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
@@ -129,6 +130,8 @@ class Shvps:
         How long to wait for each answer.
     ramp_V_per_s : float
         Ramp until `set_ramp` says otherwise.
+    boot_s : float
+        How long the first answer may take.
     """
 
     measures_current = False
@@ -141,6 +144,7 @@ class Shvps:
         poll_rate_Hz: float = 20.0,
         timeout_s: float = 0.1,
         ramp_V_per_s: float = 100.0,
+        boot_s: float = 0.0,
     ) -> None:
         self.name = name
         self.identity = Identity()
@@ -150,7 +154,11 @@ class Shvps:
         self._link = link
         self._codec = Codec(self.counters)
         self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
-        self._dialogue: Dialogue[str, str] = Dialogue(self._label, self._send, self.counters, timeout_s=timeout_s)
+        self._boot_s = boot_s
+        self._heard = Heard()
+        self._dialogue: Dialogue[str, str] = Dialogue(
+            self._label, self._send, self.counters, timeout_s=timeout_s, heard=self._heard
+        )
         self._inbox: deque[str] = deque()
         self._samples: list[HVSample] = []
         self._now = self._next_poll = 0.0
@@ -243,7 +251,7 @@ class Shvps:
     def poll(self, now: float) -> Sequence[HVSample]:
         self._now = now
         try:
-            self._inbox.extend(self._codec.feed(self._link.read()))
+            self._inbox.extend(self._codec.feed(self._heard.bytes(self._link.read())))
             while self._inbox:
                 if not self._dialogue.offer(self._inbox.popleft(), now):
                     self.counters["unexpected_replies"] += 1
@@ -327,7 +335,7 @@ class Shvps:
         )
 
     def _set_up(self) -> Script[str, str]:
-        kind, version = version_of((yield Ask("QVer")).message)
+        kind, version = version_of((yield Ask("QVer", boot_s=self._boot_s)).message)
         if kind != "slave":
             raise DeviceRefused(
                 self._label, f"it is a {kind}, not a single-channel supply", "Connect the supply itself."

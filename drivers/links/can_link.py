@@ -21,7 +21,7 @@ from drivers.links.slcan_link import SlcanLink
 if TYPE_CHECKING:
     import can
 
-INTERFACES = ("socketcan", "slcan", "pcan", "vector", "virtual", "udp_multicast")
+INTERFACES = ("socketcan", "slcan", "pcan", "vector", "kvaser", "ixxat", "gs_usb", "virtual", "udp_multicast")
 
 SHARED = ("socketcan", "udp_multicast")
 """Interfaces that several programs of one computer may open at once."""
@@ -34,11 +34,16 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "udp_multicast": {"hop_limit": 0, "fd": False},
 }
 _WITHOUT_BITRATE = {"socketcan", "virtual", "udp_multicast"}
+_NUMBERED = {"kvaser", "ixxat", "gs_usb"}  # whose channel python-can wants as a number
 
 _ADVICE = {
     "socketcan": "It is Linux only; bring it up first: ip link set can0 up type can bitrate 125000.",
     "pcan": "Install PEAK's PCAN-Basic driver; channels are named PCAN_USBBUS1 and so on.",
     "vector": "It needs Windows and Vector's XL driver library; the channel is a number, from 0.",
+    "kvaser": "Install Kvaser's CANlib drivers; the channel is a number, from 0.",
+    "ixxat": "It needs Windows and IXXAT's VCI driver; the channel is a number, from 0.",
+    "gs_usb": "It needs the packages gs-usb and pyusb, the library libusb 1.0 and the right to use the adapter; the "
+    "channel is a number, from 0. On Linux the kernel knows such adapters: use socketcan there.",
     "udp_multicast": "It needs the package msgpack (extra `multicast`), and a multicast address such as 239.74.163.2.",
 }
 
@@ -66,8 +71,8 @@ class CanLink:
     interface : str
         One of `INTERFACES` but slcan: which python-can backend.
     channel : str
-        "can0" (socketcan), "PCAN_USBBUS1" (pcan), a number (vector), any name (virtual), a multicast address
-        (udp_multicast).
+        "can0" (socketcan), "PCAN_USBBUS1" (pcan), a number (vector, kvaser, ixxat, gs_usb), any name (virtual), a
+        multicast address (udp_multicast).
     bitrate : int
         Bits per second.
     accept : collection of int, optional
@@ -112,15 +117,20 @@ class CanLink:
             options["bitrate"] = bitrate
         try:
             return can.Bus(
-                channel=channel, interface=interface, ignore_config=True, receive_own_messages=False, **options
+                channel=_number(channel) if interface in _NUMBERED else channel,
+                interface=interface,
+                ignore_config=True,
+                receive_own_messages=False,
+                **options,
             )
-        except can.CanInterfaceNotImplementedError as error:  # python-can's word for a backend that is not installed
+        # python-can's words for a backend that is not installed, or whose library is not there
+        except (can.CanInterfaceNotImplementedError, ImportError) as error:
             raise DeviceRefused(
                 self._where,
                 f"the CAN interface cannot be used here ({error})",
                 _ADVICE.get(interface, ""),
             ) from error
-        except (can.CanError, OSError, ValueError, TypeError) as error:
+        except Exception as error:  # each maker's library has exceptions of its own
             raise DeviceLost(
                 self._where,
                 f"the CAN channel cannot be opened ({error})",
@@ -149,12 +159,16 @@ class CanLink:
             raise self._lost("the CAN controller is bus-off")
         return frames
 
-    def write(self, frame: CanFrame) -> None:
+    def write(self, frame: CanFrame, *, urgent: bool = False) -> None:
         """Send one frame, or keep it while there is no room; raises `DeviceLost` when it cannot be sent."""
         bus = self._open_bus()
         if not self._waiting:
             self._taken_at = self._clock()
-        if frame not in self._waiting:  # an off that is repeated need not wait twice
+        if urgent and frame in self._waiting:
+            self._waiting.remove(frame)
+        if urgent:
+            self._waiting.appendleft(frame)
+        elif frame not in self._waiting:  # an off that is repeated need not wait twice
             self._waiting.append(frame)
         self._send_waiting(bus)
 
@@ -287,13 +301,19 @@ def channels() -> list[tuple[str, str]]:
     import can
 
     _quiet()
-    found = can.detect_available_configs(["socketcan", "pcan", "vector"])
+    found = can.detect_available_configs(["socketcan", "pcan", "vector", "kvaser", "ixxat", "gs_usb"])
     return sorted({(str(one["interface"]), str(one["channel"])) for one in found})
 
 
 def _quiet() -> None:
     """Keep python-can from telling the terminal which adapters' drivers are missing; our errors say what matters."""
     logging.getLogger("can").addHandler(_NOWHERE)
+
+
+def _number(channel: str) -> int:
+    if not channel.isdecimal():
+        raise ValueError(f"{channel!r} is no number")
+    return int(channel)
 
 
 def _no_room(error: Exception) -> bool:

@@ -47,8 +47,8 @@ class FrameLink(Protocol):
         """All frames that have arrived since the last call, in order."""
         ...
 
-    def write(self, frame: CanFrame) -> None:
-        """Send one frame; one for which there is no room goes out later."""
+    def write(self, frame: CanFrame, *, urgent: bool = False) -> None:
+        """Send one frame; one for which there is no room goes out later, an urgent one before all others."""
         ...
 
     def reopen(self) -> bool:

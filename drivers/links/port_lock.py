@@ -19,6 +19,7 @@ from drivers.links.link import DeviceError
 from drivers.links.system import lock, user_number
 
 NAME = "dea-rig"
+_COM = re.compile(r"(?:\\\\\.\\|//\./)?(com[0-9]+):?", re.IGNORECASE)
 _TRIES = 20  # another program may remove a lock or the directory at the moment in which it is looked at
 
 
@@ -70,6 +71,20 @@ def _is_ours(folder: Path, user: int) -> bool:
     return stat.S_ISDIR(found.st_mode) and found.st_uid == user and not found.st_mode & 0o077
 
 
+def one_name(port: str) -> str:
+    r"""The one name of a port that has several, so that all of them lock the same.
+
+    A link leads to its target; ``/dev/tty.*`` and ``/dev/cu.*`` are the two doors of one port on macOS; ``COM3``,
+    ``com3:`` and ``\\.\COM3`` are one on Windows.
+    """
+    if plain := _COM.fullmatch(port):
+        return plain[1].upper()
+    if "://" in port:
+        return port.lower()
+    real = os.path.realpath(port) if os.sep in port else port.upper()
+    return real.replace("/dev/tty.", "/dev/cu.", 1) if real.startswith("/dev/tty.") else real
+
+
 class PortLock:
     """Keeps other programs of this user, and this one, from opening the same port twice.
 
@@ -84,7 +99,7 @@ class PortLock:
     """
 
     def __init__(self, device: str, port: str) -> None:
-        real = os.path.realpath(port) if os.sep in port else port.upper()
+        real = one_name(port)
         key = hashlib.sha256(real.encode()).hexdigest()[:12]
         plain = re.sub(r"[^A-Za-z0-9]+", "-", Path(real).name)
         self.fd = -1

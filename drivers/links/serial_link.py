@@ -8,6 +8,8 @@ whatever has arrived.
 from __future__ import annotations
 
 import contextlib
+import errno
+import logging
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -24,7 +26,12 @@ if TYPE_CHECKING:
 TAKES_S = 0.5  # a port that has taken nothing for so long, with bytes waiting, is lost
 MOST_WAITING = 4096  # bytes not taken yet: far more than any dialogue has outstanding
 LOOK_AGAIN_S = 0.05  # how often a lost port is looked for
+MODEM_S = 25.0  # how long opening waits for ModemManager
+BUSY_AGAIN_S = 0.25  # how often it tries
 
+LOG = logging.getLogger(__name__)
+
+_BUSY = (errno.EBUSY, errno.EAGAIN)
 _BY_ID = Path("/dev/serial/by-id")
 
 
@@ -86,7 +93,7 @@ class SerialLink:
         else:
             self._lock = PortLock(self._label, port)
             try:
-                self._port = self._open(exclusive=True)
+                self._port = self._open_once_free()
             except _UNUSABLE as error:
                 self._lock.release()
                 raise _not_opened(self._label, port, error) from None
@@ -94,6 +101,29 @@ class SerialLink:
         timer = Path("/sys/class/tty", Path(os.path.realpath(port)).name, "device/latency_timer")
         with contextlib.suppress(OSError):  # FTDI adapters on Linux
             self.settings["latency_timer_ms"] = timer.read_text().strip()
+
+    def _open_once_free(self) -> Port:
+        """Open it; wait for ModemManager, which keeps a port for some ten seconds after it was plugged in."""
+        began = self._clock()
+        told = False
+        while True:
+            try:
+                port = self._open(exclusive=True)
+            except OSError as error:
+                if error.errno not in _BUSY or not modem_manager() or self._clock() - began > MODEM_S:
+                    raise
+            else:
+                if told:
+                    waited = self._clock() - began
+                    self.settings["remark"] = (
+                        f"ModemManager had the port for {waited:.1f} s. {_against_modem_manager(self._path)}"
+                    )
+                return port
+            if not told:
+                told = True
+                advice = _against_modem_manager(self._path)
+                LOG.warning("%s: ModemManager has the port; waiting up to %g s. %s", self._label, MODEM_S, advice)
+            time.sleep(BUSY_AGAIN_S)
 
     def _open(self, *, exclusive: bool | None, path: str = "") -> Port:
         import serial
@@ -115,13 +145,17 @@ class SerialLink:
         except GONE as error:
             raise self._lost("reading", error) from None
 
-    def write(self, data: bytes) -> None:
-        """Send ``data``, or keep what the port does not take now."""
+    def write(self, data: bytes, *, behind: bytes | None = None) -> None:
+        """Send ``data``, or keep what the port does not take now.
+
+        ``behind`` is the end of a line: ``data`` then overtakes what waits, behind the line that is under way.
+        """
         try:
             port = self._open_port()
             if not self._waiting:
                 self._taken_at = self._clock()
-            self._waiting += data
+            place = len(self._waiting) if behind is None else self._waiting.find(behind) + len(behind)
+            self._waiting[place:place] = data
             self._send(port)
         except GONE as error:
             raise self._lost("writing", error) from None
@@ -243,6 +277,28 @@ def _usb_serial(device: str) -> str:
     return ""
 
 
+def modem_manager() -> bool:
+    """Whether ModemManager runs here. Whose port it has it does not tell to others than root."""
+    for name in Path("/proc").glob("[0-9]*/comm"):
+        with contextlib.suppress(OSError):
+            if name.read_text().strip() == "ModemManager":
+                return True
+    return False
+
+
+def _against_modem_manager(port: str) -> str:
+    folder = Path(os.path.realpath(f"/sys/class/tty/{Path(os.path.realpath(port)).name}/device"))
+    ids = ["XXXX", "XXXX"]  # lsusb shows them
+    for parent in (folder, *folder.parents[:3]):
+        with contextlib.suppress(OSError):
+            ids = [(parent / key).read_text().strip() for key in ("idVendor", "idProduct")]
+            break
+    return (
+        "To end that, put this line into /etc/udev/rules.d/99-dea-rig.rules and plug it in again: "
+        f'ATTRS{{idVendor}}=="{ids[0]}", ATTRS{{idProduct}}=="{ids[1]}", ENV{{ID_MM_DEVICE_IGNORE}}="1"'
+    )
+
+
 def ports() -> list[str]:
     """Names of the serial ports that this machine has."""
     from serial.tools import list_ports
@@ -264,6 +320,9 @@ def _not_opened(label: str, port: str, error: Exception) -> DeviceError:
             f"port {port} may not be opened by this user",
             "On Linux, become a member of the group that owns it (dialout, uucp) and log in again.",
         )
+    if number in _BUSY and modem_manager():
+        what = f"port {port} is in use, perhaps by ModemManager, for more than {MODEM_S:g} s"
+        return DeviceError(label, what, _against_modem_manager(port))
     return DeviceError(label, f"port {port} cannot be opened ({_reason(error)})", there)
 
 

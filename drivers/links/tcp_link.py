@@ -92,13 +92,14 @@ class TcpLink:
             raise self._lost("the other end closed it")
         return data
 
-    def write(self, data: bytes) -> None:
-        """Send ``data``, or keep what the connection does not take now."""
+    def write(self, data: bytes, *, behind: bytes | None = None) -> None:
+        """Send ``data``, or keep what the connection does not take now; ``behind`` as `SerialLink.write` has it."""
         try:
             connection = self._connected()
             if not self._waiting:
                 self._taken_at = self._clock()
-            self._waiting += data
+            place = len(self._waiting) if behind is None else self._waiting.find(behind) + len(behind)
+            self._waiting[place:place] = data
             self._send(connection)
         except OSError as error:
             raise self._lost(error.strerror or str(error)) from None

@@ -49,7 +49,7 @@ class MemoryFrameLink:
         except WireGone:
             raise DeviceLost(self.name, "the simulated bus is gone") from None
 
-    def write(self, frame: CanFrame) -> None:
+    def write(self, frame: CanFrame, *, urgent: bool = False) -> None:
         try:
             self._wire.host_write((frame.id, frame.data), self._clock.now())
         except WireGone:

@@ -57,9 +57,9 @@ class TappedFrameLink:
             self._tap(self._role, "rx", frame.id.to_bytes(2, "big") + frame.data, self._when())
         return frames
 
-    def write(self, frame: CanFrame) -> None:
+    def write(self, frame: CanFrame, *, urgent: bool = False) -> None:
         self._tap(self._role, "tx", frame.id.to_bytes(2, "big") + frame.data, self._when())
-        self._link.write(frame)
+        self._link.write(frame, urgent=urgent)
 
     def reopen(self) -> bool:
         return self._link.reopen()

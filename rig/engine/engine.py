@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from rig.safety.remote import RemoteGuard
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.002, 0.005  # the loop comes round at these intervals, as the devices wish
-SETUP_LIMIT_S = 15.0
+SETUP_LIMIT_S = 15.0  # besides what the devices may take to start
+SHOWN_EVERY_S = 2.0  # how often those are named that have not answered yet
 SNAPSHOT_S = 1.0  # before and after what ended a run under voltage: the log holds every sample of it, and says where
 ROUNDING_S = 1e-6  # of clock times: whether a turn is the last one must not hang on the last digit
 OUTPUT_LIMIT_S = 3.0  # how long a supply may take after set-up to be measured off
@@ -219,12 +220,16 @@ class Engine:
         self.bench.attach(self.recorder.wire)
         self._appoint_guard()
         devices = self.bench.devices
-        end = self.clock.now() + SETUP_LIMIT_S
-        while not all(device.ready for device in devices.values()):
+        began, told = self.clock.now(), 0.0
+        limit = SETUP_LIMIT_S + max(table.boot_s for table in self.bench.scene.instruments.values())
+        while waiting := ", ".join(name for name, device in devices.items() if not device.ready):
             self._turn()
-            if self.clock.now() > end:
-                waiting = [name for name, device in devices.items() if not device.ready]
-                raise FaultError(f"{', '.join(waiting)}: not ready within {SETUP_LIMIT_S:.0f} s of set-up.")
+            waited = self.clock.now() - began
+            if waited > limit:
+                raise FaultError(f"{waiting}: not ready within {limit:.0f} s of set-up.")
+            if waited > told + SHOWN_EVERY_S:
+                told = waited
+                self.control.say(f"Waiting for {waiting} to answer and to be set up: {waited:.0f} s of {limit:.0f} s.")
         for role in devices:
             self._check_identity(role)
         unit = self.bench.force.reading_unit
@@ -252,7 +257,10 @@ class Engine:
     def _check_identity(self, role: str) -> None:
         table, device = self.bench.scene.instruments[role], self.bench.devices[role]
         found = device.identity
-        self.recorder.identity(role, found, {**device.settings, **self.bench.link_settings(role)})
+        link_settings = self.bench.link_settings(role)
+        self.recorder.identity(role, found, {**device.settings, **link_settings})
+        if remark := link_settings.get("remark"):
+            self._remark(role, remark)
         if table.serial is not None and table.serial != found.serial:
             raise ConfigError(
                 f"{role}: serial number {table.serial} is wanted, but {found.serial or 'no serial number'} "
@@ -264,6 +272,11 @@ class Engine:
             for problem in certificate.check(found.serial, today):
                 self.recorder.certificate_problem(role, problem)
                 self.recorder.event("warning", role, problem)
+
+    def _remark(self, role: str, remark: str) -> None:
+        """Something that the operator should know of an instrument, and that ends nothing."""
+        self.recorder.event("warning", role, remark)
+        self.control.say(f"{role}: {remark}.")
 
     def _check_output(self) -> None:
         """High voltage must be measured off before anything moves: nobody stretches a film under unknown voltage."""

@@ -18,6 +18,7 @@ INSTRUMENTS = list(registered().instruments.values())
 # driver, key: default, smallest, largest as the documentation has them; "(0" excludes the 0 itself, "-" is none.
 DOCUMENTED = """
 zaber        timeout_s               0.25      (0     10
+zaber        boot_s                  10.0      0      60
 zaber        baud                    115200    (0     -
 zaber        poll_rate_Hz            50.0      5      200
 zaber        approach_from_mm        0.0       0      -
@@ -25,12 +26,14 @@ zaber        device                  1         1      99
 zaber        axis                    1         1      9
 zaber        full_step_um            31.75     (0     -
 gsv8         timeout_s               0.25      (0     10
+gsv8         boot_s                  10.0      0      60
 gsv8         baud                    230400    (0     -
 gsv8         channel                 1         1      8
 gsv8         rate_Hz                 100.0     (0     2000
 gsv8         int_full_scale          1.05      0.5    2
 gsv8         input_range_mV_per_V    None      (0     1000
 cia404       timeout_s               0.25      (0     10
+cia404       boot_s                  10.0      0      60
 cia404       bitrate                 125000    (0     -
 cia404       node                    1         1      127
 cia404       channel                 1         1      199
@@ -38,12 +41,14 @@ cia404       rate_Hz                 100.0     (0     1000
 cia404       factor                  1.0       -      -
 cia404       limit_N                 10000.0   (0     -
 keyence-lkg  timeout_s               0.25      (0     10
+keyence-lkg  boot_s                  10.0      0      60
 keyence-lkg  baud                    115200    (0     -
 keyence-lkg  output                  1         1      2
 keyence-lkg  poll_rate_Hz            50.0      5      200
 keyence-lkg  unit_mm                 1.0       (0     -
 keyence-lkg  limit_mm                80.0      (0     -
 iseg-edcp    timeout_s               0.25      (0     10
+iseg-edcp    boot_s                  10.0      0      60
 iseg-edcp    bitrate                 125000    (0     -
 iseg-edcp    ramp_V_per_s            100.0     (0     -
 iseg-edcp    parallel_capacitance_nF 0.0       0      -
@@ -52,11 +57,13 @@ iseg-edcp    channel                 0         0      23
 iseg-edcp    max_ramp_percent_per_s  20.0      (0     100
 iseg-edcp    poll_rate_Hz            10.0      (0     50
 shvps        timeout_s               0.25      (0     10
+shvps        boot_s                  10.0      0      60
 shvps        baud                    115200    (0     -
 shvps        ramp_V_per_s            100.0     (0     -
 shvps        parallel_capacitance_nF 0.0       0      -
 shvps        poll_rate_Hz            10.0      (0     20
 labjack-amplifier     timeout_s                0.25  (0  10
+labjack-amplifier     boot_s                   10.0  0   60
 labjack-amplifier     tcp_port                 502   1   65535
 labjack-amplifier     ramp_V_per_s             100.0 (0  -
 labjack-amplifier     parallel_capacitance_nF  0.0   0   -
@@ -75,11 +82,13 @@ labjack-amplifier     proof_V                  50.0  (0  55
 labjack-amplifier     proof_tolerance          0.15  (0  0.5
 labjack-amplifier     poll_rate_Hz             20.0  2   100
 labjack-force         timeout_s                0.25  (0  10
+labjack-force         boot_s                   10.0  0   60
 labjack-force         tcp_port                 502   1   65535
 labjack-force         ain                      2     0   13
 labjack-force         newtons_per_V            needed - -
 labjack-force         rate_Hz                  50.0  (0  200
 labjack-displacement  timeout_s                0.25  (0  10
+labjack-displacement  boot_s                   10.0  0   60
 labjack-displacement  tcp_port                 502   1   65535
 labjack-displacement  ain                      3     0   13
 labjack-displacement  mm_per_V                 needed - -
@@ -93,6 +102,7 @@ ascii-stream          factor                   1.0   -   -
 ascii-stream          limit                    10000.0 (0 -
 ascii-stream          boot_s                   3.0   0   30
 optoncdt-1420         timeout_s                0.25  (0  10
+optoncdt-1420         boot_s                   10.0  0   60
 optoncdt-1420         baud                     921600 (0 -
 optoncdt-1420         measuring_range_mm       50.0  (0  -
 optoncdt-1420         rate_Hz                  250.0 (0  4000

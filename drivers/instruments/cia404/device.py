@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, label
+from drivers.heard import Heard
 from drivers.instruments.cia404.codec import (
     AUTOZERO,
     DECIMALS,
@@ -90,6 +91,8 @@ class CiA404:
         Reading unit and what to multiply the device's value with, instead of the unit it states.
     limit_N : float
         Largest magnitude of a reading in newtons that is believed.
+    boot_s : float
+        How long the first answer may take.
     """
 
     def __init__(
@@ -105,6 +108,7 @@ class CiA404:
         unit: Literal["N", "mV/V"] | None = None,
         factor: float = 1.0,
         limit_N: float = 1e4,
+        boot_s: float = 0.0,
     ) -> None:
         where = label(name, link)
         if not 1 <= node <= 127:
@@ -137,6 +141,8 @@ class CiA404:
         self._stated = (unit, factor) if unit is not None else None
         self._factor = factor
         self._limit_N = limit_N
+        self._boot_s = boot_s
+        self._heard = Heard()
         self._decoder = Decoder(node, self.counters)
         self._dialogue: Dialogue[_Request, Message] = Dialogue(
             where,
@@ -144,6 +150,7 @@ class CiA404:
             self.counters,
             timeout_s=timeout_s,
             advice=f"Check power, CAN cable and termination, bit rate, and that the device is node {node}.",
+            heard=self._heard,
         )
         self._layout = Layout((), channel)
         self._stream: Stream[ForceSample] | None = None
@@ -178,7 +185,7 @@ class CiA404:
 
     def poll(self, now: float) -> Sequence[ForceSample]:
         self._next_poll = now + LOST_AGAIN_S
-        self._inbox.extend(self._link.read())
+        self._inbox.extend(self._heard.frames(self._link.read()))
         if self._stream is None and self._dialogue.idle:
             self.counters["ignored_frames"] += len(self._inbox)  # they belong to an earlier conversation
             self._inbox.clear()
@@ -248,7 +255,8 @@ class CiA404:
     def _read(self, index: int, sub: int, length: int) -> Generator[_Step, _Got, int | Aborted]:
         """An unsigned number of at most ``length`` bytes, or the reason why it cannot be read."""
         frame = upload_request(self._node, index, sub)
-        answer = (yield Ask(_Request(frame, index, sub))).message
+        boot_s = 0.0 if self.counters["round_trips"] else self._boot_s
+        answer = (yield Ask(_Request(frame, index, sub), boot_s=boot_s)).message
         if isinstance(answer, Aborted):
             return answer
         assert isinstance(answer, Uploaded)
@@ -281,7 +289,7 @@ class CiA404:
         yield from self._set_timer()
         self._emergency = 0
         self._link.write(nmt(self._node, "start"))
-        self._stream = Stream(self._label, self._rate, self._timeout, self._interval, self.counters)
+        self._stream = Stream(self._label, self._rate, self._timeout, self._interval, self.counters, self._heard)
 
     def _read_unit(self) -> Generator[_Step, _Got, None]:
         code = yield from self._read(UNIT, self._channel, 4)

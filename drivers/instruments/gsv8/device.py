@@ -11,6 +11,7 @@ from typing import Literal
 
 from drivers.dialogue import LOST_AGAIN_S, Ask, Dialogue, label
 from drivers.dialogue import Answer as Answered
+from drivers.heard import Heard
 from drivers.instruments.gsv8.codec import (
     COMMANDS,
     GET_FIRMWARE_VERSION,
@@ -92,6 +93,8 @@ class GSV8:
         Overrides the input range read from the amplifier.
     int_full_scale : float
         Signal at the largest integer, in input ranges.
+    boot_s : float
+        How long the first answer may take.
     """
 
     reading_unit = "mV/V"
@@ -109,6 +112,7 @@ class GSV8:
         user_scale_of: Literal["range", "mV/V"] = "range",
         input_range_mV_per_V: float | None = None,
         int_full_scale: float = 1.05,
+        boot_s: float = 0.0,
     ) -> None:
         where = label(name, link)
         if not 1 <= channel <= 16:
@@ -128,6 +132,8 @@ class GSV8:
         self._frame_type: FrameType = frame_type
         self._timeout = timeout_s
         self._interval = poll_interval_s
+        self._boot_s = boot_s
+        self._heard = Heard()
         self._user_scale_of = user_scale_of
         self._range = input_range_mV_per_V
         self._int_full_scale = int_full_scale
@@ -138,6 +144,7 @@ class GSV8:
             self.counters,
             timeout_s=timeout_s,
             advice="Check that the amplifier is switched on, its cable, and the baud rate.",
+            heard=self._heard,
         )
         self._settle_s = 0.0
         self._gain = math.nan
@@ -176,7 +183,7 @@ class GSV8:
 
     def poll(self, now: float) -> Sequence[ForceSample]:
         self._next_poll = now + LOST_AGAIN_S
-        data = self._link.read()
+        data = self._heard.bytes(self._link.read())
         if self._fresh:
             data = b""  # whatever was in the line belongs to an earlier conversation
         self._fresh = False
@@ -231,7 +238,8 @@ class GSV8:
     def _exchange(self, request: _Request, delay_s: float = 0) -> Generator[_Step, _Got, Message]:
         delay_s, self._settle_s = max(delay_s, self._settle_s), self._timeout  # in case this one goes wrong
         retries = self.counters["retries"]
-        answer = yield Ask(request, delay_s=delay_s)
+        boot_s = 0.0 if self.counters["round_trips"] else self._boot_s
+        answer = yield Ask(request, delay_s=delay_s, boot_s=boot_s)
         if self.counters["retries"] == retries:
             self._settle_s = 0.0
         return answer.message
@@ -272,7 +280,7 @@ class GSV8:
         self.settings["data_rate_Hz"] = f"{rate:.9g}"
         yield from self._check_frame()
         yield from self._demand(START_TRANSMISSION)
-        self._stream = Stream(self._label, self._rate, self._timeout, self._interval, self.counters)
+        self._stream = Stream(self._label, self._rate, self._timeout, self._interval, self.counters, self._heard)
 
     def _read_scaling(self, channel: bytes) -> Generator[_Step, _Got, None]:
         reply = yield from self._ask(GET_INPUT_TYPE, channel + b"\xff", lengths=(5,))

@@ -105,6 +105,8 @@ class LabJackAmplifier:
         The step that proves gain and monitor, how far off it may be (relative), and how long it is waited for.
     poll_rate_Hz : float
         How often monitors and outputs are read; also the rate of the ramp's steps.
+    boot_s : float
+        How long the first answer may take.
     """
 
     measures_current = True
@@ -127,12 +129,13 @@ class LabJackAmplifier:
         poll_rate_Hz: float = 20.0,
         timeout_s: float = 0.25,
         ramp_V_per_s: float = 100.0,
+        boot_s: float = 0.0,
     ) -> None:
         self.name = name
         self.identity = Identity()
         self.settings: dict[str, str] = {}
         self.counters: dict[str, int] = {"lagging": 0, "over_range": 0, "watchdog_keys": 0}
-        self._registers = Registers(name, link, self.counters, timeout_s)
+        self._registers = Registers(name, link, self.counters, timeout_s, boot_s)
         self._label = self._registers.label
         self._dialogue = self._registers.dialogue
         self._link = link

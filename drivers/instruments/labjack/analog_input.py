@@ -24,10 +24,19 @@ class AnalogInput(Generic[S]):
         The input, 0 for AIN0.
     rate_Hz : float
         How often it is read.
+    boot_s : float
+        How long the first answer may take.
     """
 
     def __init__(
-        self, name: str, link: ByteLink, *, ain: int = 2, rate_Hz: float = 50.0, timeout_s: float = 0.25
+        self,
+        name: str,
+        link: ByteLink,
+        *,
+        ain: int = 2,
+        rate_Hz: float = 50.0,
+        timeout_s: float = 0.25,
+        boot_s: float = 0.0,
     ) -> None:
         self.name = name
         self.identity = Identity()
@@ -35,7 +44,7 @@ class AnalogInput(Generic[S]):
         self.counters: dict[str, int] = {"over_range": 0}
         self._link = link
         self._ain, self._rate = ain, rate_Hz
-        self._registers = Registers(name, link, self.counters, timeout_s)
+        self._registers = Registers(name, link, self.counters, timeout_s, boot_s)
         self._schedule = Schedule(1.0 / rate_Hz, self.counters)
         self._samples: deque[S] = deque()
         self._range = math.nan
@@ -111,8 +120,9 @@ class AnalogForce(AnalogInput[ForceSample]):
         ain: int = 2,
         rate_Hz: float = 50.0,
         timeout_s: float = 0.25,
+        boot_s: float = 0.0,
     ) -> None:
-        super().__init__(name, link, ain=ain, rate_Hz=rate_Hz, timeout_s=timeout_s)
+        super().__init__(name, link, ain=ain, rate_Hz=rate_Hz, timeout_s=timeout_s, boot_s=boot_s)
         self._scale = newtons_per_V
 
     def _sample(self, t: float, volts: float, flags: SampleFlag) -> ForceSample:
@@ -131,8 +141,9 @@ class AnalogDisplacement(AnalogInput[DisplacementSample]):
         ain: int = 3,
         rate_Hz: float = 50.0,
         timeout_s: float = 0.25,
+        boot_s: float = 0.0,
     ) -> None:
-        super().__init__(name, link, ain=ain, rate_Hz=rate_Hz, timeout_s=timeout_s)
+        super().__init__(name, link, ain=ain, rate_Hz=rate_Hz, timeout_s=timeout_s, boot_s=boot_s)
         self._scale = mm_per_V * 1e-3
 
     def _sample(self, t: float, volts: float, flags: SampleFlag) -> DisplacementSample:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from drivers.dialogue import Answer, Ask, Dialogue, label
+from drivers.heard import Heard
 from drivers.instruments.labjack.codec import (
     AIN0,
     AIN0_RANGE,
@@ -53,12 +54,16 @@ Script = Part[None]
 class Registers:
     """Registers of one LabJack over one connection."""
 
-    def __init__(self, name: str, link: ByteLink, counters: dict[str, int], timeout_s: float) -> None:
+    def __init__(
+        self, name: str, link: ByteLink, counters: dict[str, int], timeout_s: float, boot_s: float = 0.0
+    ) -> None:
         self.label = label(name, link)
         self._link = link
         self._counters = counters
         counters.setdefault("unexpected_replies", 0)
         self._decoder = Decoder(counters)
+        self._boot_s = boot_s
+        self._heard = Heard()
         self._transaction = 0
         self.dialogue: Dialogue[Request, Message] = Dialogue(
             self.label,
@@ -66,11 +71,12 @@ class Registers:
             counters,
             timeout_s=timeout_s,
             advice="Check that it is switched on, its network cable and its address.",
+            heard=self._heard,
         )
 
     def take_in(self, now: float) -> None:
         """Read the link and give what came to the dialogue."""
-        for message in self._decoder.feed(self._link.read()):
+        for message in self._decoder.feed(self._heard.bytes(self._link.read())):
             if not self.dialogue.offer(message, now):
                 self._counters["unexpected_replies"] += 1
 
@@ -105,8 +111,8 @@ class Registers:
 
         return fits
 
-    def _answered(self, request: Request, delay_s: float = 0.0) -> Part[Answer[Message]]:
-        answer = yield Ask(request, delay_s=delay_s)
+    def _answered(self, request: Request, delay_s: float = 0.0, boot_s: float = 0.0) -> Part[Answer[Message]]:
+        answer = yield Ask(request, delay_s=delay_s, boot_s=boot_s)
         if isinstance(answer.message, Refused):
             raise DeviceRefused(
                 self.label, f"{request} refused: {answer.message.meaning}", "Check its model and its firmware version."
@@ -126,15 +132,15 @@ class Registers:
         values, _ = yield from self.floats(address)
         return values[0]
 
-    def whole(self, address: int) -> Part[int]:
+    def whole(self, address: int, boot_s: float = 0.0) -> Part[int]:
         """A 32-bit register."""
-        answer = yield from self._answered(Request(address, 2))
+        answer = yield from self._answered(Request(address, 2), boot_s=boot_s)
         assert isinstance(answer.message, Words)
         return int(struct.unpack(">I", answer.message.data)[0])
 
     def identify(self, settings: dict[str, str]) -> Part[tuple[Identity, Product]]:
         """Prove that it is a LabJack whose words come in the expected order, and say which."""
-        test = yield from self.whole(TEST)
+        test = yield from self.whole(TEST, self._boot_s)
         if test != TEST_VALUE:
             raise DeviceRefused(
                 self.label,

@@ -126,6 +126,9 @@ CHANNELS = {
     "slcan": "/dev/does-not-exist",
     "pcan": "PCAN_USBBUS1",
     "vector": "0",
+    "kvaser": "0",
+    "ixxat": "0",
+    "gs_usb": "0",
     "virtual": "test-open",
     "udp_multicast": "239.74.163.2",
 }
