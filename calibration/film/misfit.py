@@ -33,6 +33,9 @@ VISIBLE = 1e-3  # share of a shape that the parameters must leave over; less is 
 # Chi-square by which one suspect must explain the residuals better than another one to be told from it: at least, and
 # as a part of what it explains (shapes are of first order).
 TELL_APART, TELL_PART = 9.2, 0.05
+# Times its usual size: an error that the budget counts is not larger on any rig, and shapes of first order say nothing
+# of it there. Where it would show only beyond, it does not show; found beyond, it is something else.
+FAR = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,8 @@ def _judged(one: _Seen, count: int) -> Suspect:
         deviations = abs(deviations)
     chance = 0.5 * sides * math.erfc(deviations / math.sqrt(2.0))
     reported = NormalDist().inv_cdf(1.0 - SIGNIFICANT / sides / count)
+    shows_from = (reported + ALMOST_SURE) * one.uncertainty
+    most = FAR * one.kind.usual if one.kind.part else math.inf
     return Suspect(
         name=one.name,
         family=one.kind.name,
@@ -84,9 +89,9 @@ def _judged(one: _Seen, count: int) -> Suspect:
         uncertainty=one.uncertainty,
         unit=one.kind.unit,
         probability=min(1.0, count * chance),
-        shows_from=(reported + ALMOST_SURE) * one.uncertainty,
+        shows_from=shows_from if shows_from <= most else math.inf,
         usual=one.kind.usual,
-        possible=one.kind.sign == 0 or one.amplitude >= 0.0,
+        possible=(one.kind.sign == 0 or one.amplitude >= 0.0) and abs(one.amplitude) <= most,
         part=one.kind.part,
         remedy=one.kind.remedy,
         shape=one.shape,

@@ -158,7 +158,8 @@ class Suspect:
     ``amplitude`` with its standard ``uncertainty`` is its size in ``unit``; ``probability`` of as much by chance
     counts that several suspects were looked at. From the size ``shows_from`` on, 95 of 100 experiments like this one
     would report it; infinite where no size would show, because it does to these data what another film does. ``usual``
-    is a size that occurs. ``possible`` is False for a size of the impossible sign. ``part`` is the entry of the
+    is a size that occurs. ``possible`` is False for a size that cannot be: of the impossible sign, or of an error that the
+    budget counts and far beyond any rig's. ``part`` is the entry of the
     uncertainty budget that counts it already, and ``key`` asks for it to be fitted along. ``remedy`` tells how to rule
     it out, or to find it. ``shape`` is what one unit of it does to the weighted data.
     """

@@ -79,6 +79,7 @@ def command(
     and decimal sign. What is understood of a table is printed first; what cannot be understood is asked for, with the
     option that tells it.
     """
+    from calibration.film.cards import without_card
     from rig.analysis.film import identify_logs, write_cards, write_results
     from rig.base.outputs import check_new
     from rig.base.progress import progress
@@ -122,11 +123,12 @@ def command(
             found = identify_logs(list(logs), **settings)
     write_results(found, out, report)
     written = [] if cards is None else write_cards(found.identification, cards)
+    without = [] if cards is None else without_card(found.identification.material)
     parts = [comparison_table(found.comparison)] if comparing else []
     parts += [posterior_table(found.identification)] if posterior else []
     if found.spreads:
         parts.append(spread_table(found.spreads))
-    show(identification_table(found.identification), *parts, *(f"note: {note}" for note in found.notes))
+    show(identification_table(found.identification), *parts, *(f"note: {note}" for note in (*found.notes, *without)))
     tell_written(out, report, tidy, *written)
 
 

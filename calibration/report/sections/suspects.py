@@ -31,7 +31,7 @@ def _row(fit: Identification, suspect: Suspect) -> list[Any]:
 
     factor, unit = SHOWN[suspect.unit]
     row: list[Any] = [suspect.name]
-    if math.isfinite(suspect.uncertainty):
+    if math.isfinite(suspect.shows_from):
         amplitude, uncertainty = rounded(suspect.amplitude * factor, suspect.uncertainty * factor)
         row += [f"{amplitude} ± {uncertainty} {unit}", f"{two_digits(suspect.shows_from * factor)} {unit}"]
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,12 @@ def draw(random: np.random.Generator, stated: Mapping[str, float]) -> dict[str, 
     return {name: 1.0 + size * random.standard_normal() for name, size in stated.items()}
 
 
+@lru_cache(maxsize=4)
+def ideal_curves(film: Cone, voltages: tuple[float, ...]) -> list[Callable[[Array], Array]]:
+    """Force at every voltage by displacement; experiments that differ by their noise share it."""
+    return film.curves(voltages, HIGHEST_M)
+
+
 def measured(
     random: np.random.Generator,
     *,
@@ -100,7 +107,7 @@ def measured(
     curves = []
     factor = wrong.get("voltage_at_film", 1.0)
     levels = [one * factor for one in voltages]
-    ideal = real.curves([*levels, *(0.9 * one for one in levels)], HIGHEST_M)
+    ideal = ideal_curves(real, (*levels, *(0.9 * one for one in levels if voltage_of is not None)))
     for sweep in sweeps(samples, voltages):
         force = ideal[sweep.number](sweep.h)
         if voltage_of is not None and sweep.voltage > 0.0:
