@@ -176,9 +176,12 @@ def identify(
             "terms": terms,
             "starts": starts,
             "seed": seed,
+            "negative_exponents": negative_exponents,
+            "profiles": profiles,
             "fixed": held,
             "wrinkling": wrinkling,
             "along": [*along],
+            "fixed_stretch": None if fixed_stretch is None else list(fixed_stretch),
         },
         "software": {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")},
     }

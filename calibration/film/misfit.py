@@ -33,9 +33,9 @@ VISIBLE = 1e-3  # share of a shape that the parameters must leave over; less is 
 # Chi-square by which one suspect must explain the residuals better than another one to be told from it: at least, and
 # as a part of what it explains (shapes are of first order).
 TELL_APART, TELL_PART = 9.2, 0.05
-# Times its usual size: an error that the budget counts is not larger on any rig, and shapes of first order say nothing
-# of it there. Where it would show only beyond, it does not show; found beyond, it is something else.
-FAR = 10.0
+# Times its usual size. An error that the budget counts is not much larger on any rig, and shapes of first order say
+# little of it there: where it would show only beyond, it does not show.
+FAR = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def _judged(one: _Seen, count: int) -> Suspect:
         probability=min(1.0, count * chance),
         shows_from=shows_from if shows_from <= most else math.inf,
         usual=one.kind.usual,
-        possible=(one.kind.sign == 0 or one.amplitude >= 0.0) and abs(one.amplitude) <= most,
+        possible=one.kind.sign == 0 or one.amplitude >= 0.0,
         part=one.kind.part,
         remedy=one.kind.remedy,
         shape=one.shape,

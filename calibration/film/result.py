@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -157,11 +156,10 @@ class Suspect:
 
     ``amplitude`` with its standard ``uncertainty`` is its size in ``unit``; ``probability`` of as much by chance
     counts that several suspects were looked at. From the size ``shows_from`` on, 95 of 100 experiments like this one
-    would report it; infinite where no size would show, because it does to these data what another film does. ``usual``
-    is a size that occurs. ``possible`` is False for a size that cannot be: of the impossible sign, or of an error that the
-    budget counts and far beyond any rig's. ``part`` is the entry of the
-    uncertainty budget that counts it already, and ``key`` asks for it to be fitted along. ``remedy`` tells how to rule
-    it out, or to find it. ``shape`` is what one unit of it does to the weighted data.
+    would report it; infinite where no size that occurs would show, because it does to these data what another film
+    does. ``usual`` is a size that occurs. ``possible`` is False for a size of the impossible sign. ``part`` is the
+    entry of the uncertainty budget that counts it already, and ``key`` asks for it to be fitted along. ``remedy`` tells
+    how to rule it out, or to find it. ``shape`` is what one unit of it does to the weighted data.
     """
 
     name: str
@@ -507,14 +505,9 @@ class Identification:
             "provenance": self.provenance,
         }
 
-    def to_json(self, comparison: Sequence[Identification] = ()) -> str:
-        """`to_dict` as JSON text, with what a ``comparison`` of several numbers of terms says beside it."""
-        values = self.to_dict()
-        if comparison:
-            values["comparison"] = [
-                {name: one.to_dict()[name] for name in ("terms", "aicc", "bic", "held_out")} for one in comparison
-            ]
-        return json.dumps(values, indent=2, allow_nan=False) + "\n"
+    def to_json(self) -> str:
+        """`to_dict` as JSON text."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
 
 
 def quantity_dict(quantity: Quantity) -> dict[str, Any]:

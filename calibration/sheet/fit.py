@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -41,7 +41,8 @@ class TestsFit:
     parts the scatter about the fit, correlation allowed for; what another weighting would give instead, and for ``G``
     what the model misses at small strains (both as half-widths of uniform distributions: JCGM 100:2008, 4.3.7).
     ``r_squared`` is the share of each fitted test's variance that the model explains, ``prediction`` the same for tests
-    that took no part. ``others`` are further minima that fit equally well.
+    that took no part. ``others`` are further minima that fit equally well, ``fixed``
+    the parameters that were held, which have no quantity.
     """
 
     __test__ = False
@@ -60,6 +61,7 @@ class TestsFit:
     weighting: Weighting = "balanced"
     law: type[Law] = Ogden
     tests: dict[str, TestJudgement] = field(default_factory=dict)
+    fixed: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dictionaries."""
@@ -68,6 +70,7 @@ class TestsFit:
             "convention": CONVENTION if self.law is Ogden else self.law.description,
             "law": self.law.name,
             "weighting": self.weighting,
+            "fixed": self.fixed,
             "quantities": {name: quantity_dict(quantity) for name, quantity in self.quantities.items()},
             "r_squared": self.r_squared,
             "prediction_r_squared": {name: _finite(value) for name, value in self.prediction.items()},
@@ -100,6 +103,8 @@ def fit_tests(
     weighting: Weighting = "balanced",
     predict: Sequence[HomogeneousTest] = (),
     law: type[Law] = Ogden,
+    fixed: Mapping[str, float] | None = None,
+    negative_exponents: bool = True,
 ) -> TestsFit:
     """Fit a law to one or several tests at once.
 
@@ -116,6 +121,10 @@ def fit_tests(
         scatter of each test about a smooth curve.
     predict : sequence of HomogeneousTest
         Tests that take no part in the fit and are held against it: a fit to one mode can fail badly in another.
+    fixed : mapping of str to float, optional
+        Shape parameters of the law (``alpha1``..., ``Jm``) that are known and not fitted; they have no quantity.
+    negative_exponents : bool
+        Whether an Ogden term may have ``alpha < 0`` (with ``mu < 0``).
 
     Raises
     ------
@@ -125,19 +134,20 @@ def fit_tests(
     if not tests:
         raise TestsError("there are no tests to fit")
     used = [test.averaged() for test in tests]
-    problem = SheetProblem(used, terms, weighting, law)
-    if problem.count <= problem.size:
-        raise TestsError(f"{problem.count} stresses cannot determine {problem.size} parameters")
+    held: dict[str, Any] = {"fixed": fixed, "negative_exponents": negative_exponents}
+    problem = SheetProblem(used, terms, weighting, law, **held)
+    if problem.count <= problem.fitted:
+        raise TestsError(f"{problem.count} stresses cannot determine {problem.fitted} parameters")
     found = minima(problem, starts, seed)
     best = found[0]
     judged = judge_tests(problem, best)
     others = [
-        minima(SheetProblem(used, terms, weights, law), max(2, starts // 2), seed)[0]
+        minima(SheetProblem(used, terms, weights, law, **held), max(2, starts // 2), seed)[0]
         for weights in _others(weighting, len(used))
     ]
     factor = inflation(problem, judged)
     quantities = _quantities(problem, best, others, judged, factor)
-    equal = best.cost * (1.0 + SAME_MINIMUM * factor / (problem.count - problem.size))
+    equal = best.cost * (1.0 + SAME_MINIMUM * factor / (problem.count - problem.fitted))
     fit = TestsFit(
         mu=best.mu,
         alpha=best.alpha,
@@ -156,6 +166,7 @@ def fit_tests(
         weighting=weighting,
         law=law,
         tests=judged,
+        fixed=problem.fixed,
     )
     fit.warnings.extend(warnings_of(problem, best, judged, quantities["G"].value))
     fit.warnings.extend(_warnings(fit, tests, predict))
@@ -171,7 +182,7 @@ def _others(weighting: Weighting, tests: int) -> list[Weighting]:
 
 def _aicc(problem: SheetProblem, best: Minimum) -> float:
     """Akaike's criterion with the correction for few data. All laws count the same data, correlated or not."""
-    n, k = problem.count, problem.size + 1  # the scatter is estimated too
+    n, k = problem.count, problem.fitted + 1  # the scatter is estimated too
     if not best.cost > 0.0 or n - k - 1 <= 0:
         return math.nan
     return n * math.log(best.cost / n) + 2.0 * k + 2.0 * k * (k + 1.0) / (n - k - 1.0)
@@ -186,8 +197,9 @@ def _quantities(
 ) -> dict[str, Quantity]:
     """Values with standard uncertainties."""
     x = best.x
-    jacobian = problem.jacobian(x)
-    scatter = math.sqrt(factor * best.cost / (problem.count - problem.size))
+    free = problem.free
+    jacobian = problem.jacobian(x)[:, free]
+    scatter = math.sqrt(factor * best.cost / (problem.count - problem.fitted))
     norms = np.linalg.norm(jacobian, axis=0)
     norms[norms == 0.0] = 1e-30
     _, s, vt = np.linalg.svd(jacobian / norms, full_matrices=False)
@@ -197,11 +209,11 @@ def _quantities(
         mu, alpha = problem.film(at)
         return np.array([*mu, *alpha, problem.law.shear_modulus(mu.tolist(), alpha.tolist())])
 
-    gradient = np.empty((problem.size + 1, problem.size))
-    for k in range(problem.size):
+    gradient = np.empty((problem.size + 1, problem.fitted))
+    for column, k in enumerate(np.flatnonzero(free).tolist()):
         step = np.zeros(problem.size)
         step[k] = 1e-6 * max(abs(x[k]), 1e-3)
-        gradient[:, k] = (values(x + step) - values(x - step)) / (2.0 * step[k])
+        gradient[:, column] = (values(x + step) - values(x - step)) / (2.0 * step[k])
     law = problem.law
     elsewhere = np.array([[*one.mu, *one.alpha, law.shear_modulus(one.mu, one.alpha)] for one in others])
     shift = np.abs(elsewhere - values(x)).max(axis=0)
@@ -211,6 +223,8 @@ def _quantities(
     found = {}
     names = [*problem.names, "G"]
     for k, (name, value, unit) in enumerate(zip(names, values(x), units, strict=True)):
+        if name in problem.fixed:
+            continue
         budget = {
             "scatter": scatter * float(np.linalg.norm(gradient[k] @ half)),
             "weighting": float(shift[k]) / math.sqrt(3.0),

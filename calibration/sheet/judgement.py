@@ -90,7 +90,7 @@ def inflation(problem: SheetProblem, tests: dict[str, TestJudgement]) -> float:
     """Factor on variances for residuals that are not independent."""
     sizes = {t.name: int(problem.fresh[part].sum()) for t, part in zip(problem.tests, problem.parts, strict=True)}
     effective = sum(sizes[name] / one.correlation for name, one in tests.items())
-    return max(1.0, (problem.count - problem.size) / max(effective - problem.size, 1.0))
+    return max(1.0, (problem.count - problem.fitted) / max(effective - problem.fitted, 1.0))
 
 
 def _small_strain(problem: SheetProblem, part: slice, stress: Array) -> float | None:
@@ -143,7 +143,7 @@ def warnings_of(problem: SheetProblem, best: Minimum, tests: dict[str, TestJudge
 
 def _other_sign(problem: SheetProblem, best: Minimum) -> list[str]:
     """Whether a term with ``mu alpha < 0`` would fit clearly better."""
-    if problem.law is not Ogden or problem.moduli < 2 or problem.moduli > 3:
+    if problem.law is not Ogden or problem.moduli < 2 or problem.moduli > 3 or problem.fixed:
         return []
     cost, shares, alpha = unconstrained_cost(problem, problem.moduli)
     n = problem.count

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Literal
 
@@ -28,17 +28,29 @@ class SheetProblem:
     """Residuals over ``x = [shares, shape parameters]`` with ``modulus_k = scale share_k / w_k`` (`Law.weights`).
 
     ``scale`` is the neo-Hookean modulus that fits best; for Ogden's law ``share_n = mu_n alpha_n / (2 scale)``.
-    Stresses that were given before have no weight.
+    Stresses that were given before have no weight. ``fixed`` holds shape parameters that are known, by name, and
+    ``free`` tells which entries of x are not among them.
     """
 
     def __init__(
-        self, tests: Sequence[HomogeneousTest], terms: int, weighting: Weighting, law: type[Law] = Ogden
+        self,
+        tests: Sequence[HomogeneousTest],
+        terms: int,
+        weighting: Weighting,
+        law: type[Law] = Ogden,
+        *,
+        fixed: Mapping[str, float] | None = None,
+        negative_exponents: bool = True,
     ) -> None:
         self.tests = list(tests)
         self.law = law
         self.weighting = weighting
         self.moduli, self.shapes = law.counts(terms)
         self.names = law.names(self.moduli, self.shapes)
+        self.negative_exponents = negative_exponents
+        self.fixed = dict(fixed or {})
+        self.free = np.array([name not in self.fixed for name in self.names])
+        self._check_fixed()
         self.measured = np.concatenate([test.measured for test in tests])
         for test in tests:
             if not np.ptp(test.measured) > 0.0:
@@ -73,6 +85,38 @@ class SheetProblem:
     def size(self) -> int:
         """Number of parameters."""
         return self.moduli + self.shapes
+
+    @property
+    def fitted(self) -> int:
+        """Number of parameters that are not fixed."""
+        return int(self.free.sum())
+
+    def _check_fixed(self) -> None:
+        shapes = self.names[self.moduli :]
+        unknown = [name for name in self.fixed if name not in shapes]
+        if unknown:
+            known = (
+                f"what can be fixed is {', '.join(shapes)}" if shapes else f"{self.law.title} has no shape parameter"
+            )
+            raise TestsError(f"cannot fix {', '.join(unknown)}; {known}")
+        sides = [parameter.search for parameter in self.law.parameters(self.moduli, self.shapes)][self.moduli :]
+        for name, side in zip(shapes, sides, strict=True):
+            low, high = EXPONENT_BOUNDS if self.law is Ogden else side
+            if name in self.fixed and not low <= abs(self.fixed[name]) <= high:
+                raise TestsError(f"{name} = {self.fixed[name]:g} cannot be fixed: it lies between {low:g} and {high:g}")
+
+    def filled(self, x: Array, part: Array) -> Array:
+        """``x`` with ``part`` in place of those entries that are not fixed."""
+        x = x.copy()
+        x[self.free] = part
+        return x
+
+    def held(self, x: Array) -> Array:
+        """``x`` with the fixed parameters at their values."""
+        x = x.copy()
+        for name, value in self.fixed.items():
+            x[self.names.index(name)] = value
+        return x
 
     def _weights(self) -> Array:
         size: Array = np.abs(self.measured)

@@ -46,23 +46,27 @@ def minima(problem: SheetProblem, starts: int, seed: int) -> list[Minimum]:
 def _drawn_points(problem: SheetProblem, starts: int, seed: int) -> list[Array]:
     random = np.random.default_rng(seed)
     terms = problem.moduli // max(1, len(problem.law.moduli))
-    return [np.concatenate(problem.law.draw(random, terms)) for _ in range(starts)]
+    return [problem.held(np.concatenate(problem.law.draw(random, terms))) for _ in range(starts)]
 
 
-def exponent_grid(terms: int) -> Array:
-    """Exponents of both signs, evenly spaced in their logarithm."""
+def exponent_grid(terms: int, *, negative: bool = True) -> Array:
+    """Exponents of both signs, or positive ones only, evenly spaced in their logarithm."""
     half = GRID[terms] // 2
     sizes = np.exp(np.linspace(math.log(0.2), math.log(0.98 * EXPONENT_BOUNDS[1]), half))
-    return np.concatenate((-sizes[::-1], sizes))
+    return np.concatenate((-sizes[::-1], sizes)) if negative else sizes
 
 
 def _ogden_points(problem: SheetProblem, starts: int) -> list[Array]:
     """The best sets of exponents on a grid, each with its best non-negative shares."""
     terms = problem.moduli
-    grid = exponent_grid(terms)
+    free = problem.free[terms:]
+    grid = exponent_grid(terms, negative=problem.negative_exponents)
+    chosen = np.array(list(combinations(range(grid.size), int(free.sum()))), dtype=np.intp)
+    sets = np.empty((len(chosen), terms), dtype=np.intp)
+    sets[:, free], sets[:, ~free] = chosen, grid.size + np.arange(terms - free.sum())
+    grid = np.concatenate((grid, problem.held(np.zeros(problem.size))[terms:][~free]))
     columns = np.stack([_column(problem, exponent) for exponent in grid], axis=1)
     target = problem.measured * problem.weight
-    sets = np.array(list(combinations(range(grid.size), terms)))
     cost, shares = _non_negative(columns, target, sets)
     points: list[Array] = []
     for k in np.argsort(cost):
@@ -112,8 +116,6 @@ def _non_negative(columns: Array, target: Array, sets: NDArray[np.intp]) -> tupl
 
 def minimise(problem: SheetProblem, start: Array, *, confirm: bool = False) -> Minimum:
     """The minimum near ``start``; ``confirm`` lets lmfit go on from there to the last digit."""
-    from scipy.optimize import least_squares
-
     lower, upper = problem.bounds(start)
     x = np.clip(start, lower, upper)
     with np.errstate(all="ignore"):
@@ -122,14 +124,30 @@ def minimise(problem: SheetProblem, start: Array, *, confirm: bool = False) -> M
         elif problem.law is Ogden:
             x = _projected(problem, x, lower, upper)
         else:
-            options: Any = {"x_scale": "jac", "ftol": 1e-10, "xtol": 1e-10, "max_nfev": 200}
-            x = least_squares(problem.residual, x, problem.jacobian, bounds=(lower, upper), **options).x
-    if problem.law is Ogden:
+            x = _bounded(problem, x, lower, upper)
+    if problem.law is Ogden and not problem.fixed:
         order = np.argsort(x[problem.moduli :])
         x = np.concatenate((x[: problem.moduli][order], x[problem.moduli :][order]))
     mu, alpha = problem.film(x)
     residual = problem.residual(x)
     return Minimum(x, tuple(map(float, mu)), tuple(map(float, alpha)), float(residual @ residual))
+
+
+def _bounded(problem: SheetProblem, start: Array, lower: Array, upper: Array) -> Array:
+    """Least squares over all parameters that are not fixed."""
+    from scipy.optimize import least_squares
+
+    free = problem.free
+
+    def residual(part: Array) -> Array:
+        return problem.residual(problem.filled(start, part))
+
+    def jacobian(part: Array) -> Array:
+        return np.asarray(problem.jacobian(problem.filled(start, part))[:, free])
+
+    sides = lower[free], upper[free]
+    options: Any = {"x_scale": "jac", "ftol": 1e-10, "xtol": 1e-10, "max_nfev": 200}
+    return problem.filled(start, least_squares(residual, start[free], jacobian, bounds=sides, **options).x)
 
 
 def _projected(problem: SheetProblem, start: Array, lower: Array, upper: Array) -> Array:
@@ -142,6 +160,12 @@ def _projected(problem: SheetProblem, start: Array, lower: Array, upper: Array) 
 
     terms = problem.moduli
     target = problem.measured * problem.weight
+    free = problem.free[terms:]
+    exponents = start[terms:].copy()
+
+    def full(part: Array) -> Array:
+        exponents[free] = part
+        return exponents
 
     def solved(alpha: Array) -> tuple[Array, Array, Array]:
         mu = 2.0 * problem.scale / alpha
@@ -153,27 +177,31 @@ def _projected(problem: SheetProblem, start: Array, lower: Array, upper: Array) 
         shares: Array = nnls(columns / norms, target)[0] / norms
         return shares, columns, slopes
 
-    def residual(alpha: Array) -> Array:
-        shares, columns, _ = solved(alpha)
+    def residual(part: Array) -> Array:
+        shares, columns, _ = solved(full(part))
         return np.asarray(columns @ shares - target)
 
-    def jacobian(alpha: Array) -> Array:
-        shares, columns, slopes = solved(alpha)
+    def jacobian(part: Array) -> Array:
+        shares, columns, slopes = solved(full(part))
         active = columns[:, shares > 0.0]
         changes = slopes * shares
         basis, _ = np.linalg.qr(active / np.maximum(np.linalg.norm(active, axis=0), 1e-300))
-        return np.asarray(changes - basis @ (basis.T @ changes))
+        return np.asarray(changes - basis @ (basis.T @ changes))[:, free]
 
-    alpha = least_squares(
-        residual,
-        np.clip(start[terms:], lower[terms:], upper[terms:]),
-        jacobian,
-        bounds=(lower[terms:], upper[terms:]),
-        ftol=1e-12,
-        xtol=1e-10,
-        gtol=None,
-        max_nfev=150,
-    ).x
+    if free.any():
+        low, high = lower[terms:][free], upper[terms:][free]
+        found = least_squares(
+            residual,
+            np.clip(start[terms:][free], low, high),
+            jacobian,
+            bounds=(low, high),
+            ftol=1e-12,
+            xtol=1e-10,
+            gtol=None,
+            max_nfev=150,
+        )
+        full(found.x)
+    alpha = exponents
     return np.concatenate((np.clip(solved(alpha)[0], lower[:terms], upper[:terms]), alpha))
 
 
@@ -183,8 +211,8 @@ def _by_lmfit(problem: SheetProblem, start: Array, lower: Array, upper: Array) -
     import lmfit
 
     parameters = lmfit.Parameters()
-    for name, value, low, high in zip(problem.names, start, lower, upper, strict=True):
-        parameters.add(name, value=float(value), min=float(low), max=float(high))
+    for name, value, low, high, free in zip(problem.names, start, lower, upper, problem.free, strict=True):
+        parameters.add(name, value=float(value), min=float(low), max=float(high), vary=bool(free))
 
     def vector(values: lmfit.Parameters) -> Array:
         return np.array([values[name].value for name in problem.names])
@@ -194,7 +222,7 @@ def _by_lmfit(problem: SheetProblem, start: Array, lower: Array, upper: Array) -
         warnings.simplefilter("ignore")
         out = lmfit.Minimizer(lambda p: problem.residual(vector(p)), parameters, nan_policy="raise").minimize(
             method="least_squares",
-            jac=lambda p: problem.jacobian(vector(p)),
+            jac=lambda p: problem.jacobian(vector(p))[:, problem.free],
             x_scale="jac",
             ftol=1e-12,
             xtol=1e-12,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -303,7 +304,7 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
     """
     try:
         if fit is not None:
-            write_text(fit, found.identification.to_json(found.comparison))
+            write_text(fit, _as_json(found))
         if report is not None:
             from calibration.report.report import write_report
 
@@ -318,6 +319,18 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
             )
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None
+
+
+def _as_json(found: Found) -> str:
+    """The result with its comparison of terms and its statistics between specimens, where they were asked for."""
+    values = found.identification.to_dict()
+    if found.comparison:
+        values["comparison"] = [
+            {name: one.to_dict()[name] for name in ("terms", "aicc", "bic", "held_out")} for one in found.comparison
+        ]
+    if found.spreads:
+        values["between_specimens"] = {name: one.to_dict() for name, one in found.spreads.items()}
+    return json.dumps(values, indent=2, allow_nan=False) + "\n"
 
 
 def write_cards(found: Identification, folder: Path) -> list[Path]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,11 @@ def read_cones(paths: Sequence[Path], scene: Path, options: ImportOptions) -> Co
         raise DataError(f"{error}.") from None
 
 
+def hashes(paths: Sequence[Path]) -> dict[str, str]:
+    """SHA-256 of every file, by its path."""
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+
+
 def identify_cones(
     table: ConeTable, paths: Sequence[Path], scene: Path, *, law: str | None = None, **options: Any
 ) -> Found:
@@ -78,7 +84,8 @@ def identify_cones(
     """
     _, text = load_specimen(scene)
     provenance: dict[str, object] = {
-        "tables": {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths},
+        "tables": hashes(paths),
+        "scene": hashes([scene]),
         "import": [one.to_dict() for one in table.understood],
     }
     law_of = None if law is None else law_called(law)
@@ -129,6 +136,17 @@ def identify_sheets(read: SheetsRead, *, law: str = "ogden", **options: Any) -> 
         return fit_tests(read.tests, predict=read.predict, law=law_called(law), **options)
     except TestsError as error:
         raise DataError(f"{error}.") from None
+
+
+def sheets_record(paths: Sequence[Path], predict: Sequence[Path], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What a fit to tests was made from: hashes of the tables, settings, versions."""
+    software = {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")}
+    return {
+        "tables": hashes(paths),
+        "predicted": hashes(predict),
+        "settings": dict(settings),
+        "software": software,
+    }
 
 
 def compare_sheets(read: SheetsRead, weighting: Weighting) -> list[Compared]:

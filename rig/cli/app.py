@@ -20,6 +20,7 @@ ENTRY_POINTS = "dea_rig.commands"
 HELPERS = {  # modules of this package that are no commands
     "app",
     "files",
+    "fit_options",
     "import_options",
     "running",
     "show",

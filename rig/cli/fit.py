@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rig.cli.files import FILE, tell_written
+from rig.cli.files import FILE, FOLDER, tell_written
+from rig.cli.fit_options import fix_option, fixed_values
 from rig.cli.import_options import given, import_options, taken, understood_or_refused
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ LEAST_SHARE = 0.01  # of a variance, for a line in the budget on screen
 
 
 @click.command("fit")
-@click.argument("logs", nargs=-1, required=True, type=FILE)
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--scene", type=FILE, help="Scene whose [specimen] the tables are of; logs have their own inside.")
 @click.option("-o", "--out", type=FILE, help="Result as JSON.")
 @click.option("--report", type=FILE, help="Result as one self-contained HTML page.")
@@ -41,7 +42,7 @@ LEAST_SHARE = 0.01  # of a variance, for a line in the budget on screen
     show_default=True,
     help="Samples at which the film is wrinkled: leave out, or describe by the tension field. Counted either way.",
 )
-@click.option("--fix", "fixed", multiple=True, help="Hold a parameter: eps_r=2.8, alpha1=2. May be repeated.")
+@fix_option
 @click.option("--negative-exponents", is_flag=True, help="Let a term have alpha < 0 and mu < 0 as well.")
 @click.option(
     "--along",
@@ -50,7 +51,7 @@ LEAST_SHARE = 0.01  # of a variance, for a line in the budget on screen
     help="An error to be fitted along within its usual size. May be repeated.",
 )
 @click.option("--stiffness-at", help="Stretches of the stiffness that can be compared between runs, e.g. 1.5,1.2.")
-@click.option("--cards", type=FILE, help="Folder for material cards of Abaqus, Ansys, COMSOL and FEBio.")
+@click.option("--cards", type=FOLDER, help="Folder for material cards of Abaqus, Ansys, COMSOL and FEBio.")
 @import_options(cone=True)
 def command(
     logs: tuple[Path, ...],
@@ -111,7 +112,7 @@ def command(
             "wrinkled": wrinkled,
             "posterior": posterior,
             "progress": update,
-            "fixed": _fixed(fixed),
+            "fixed": fixed_values(fixed),
             "negative_exponents": negative_exponents,
             "along": along,
             "each": each,
@@ -143,7 +144,7 @@ def _of_folders(paths: Sequence[Path]) -> tuple[Path, ...]:
             continue
         logs = sorted(path.rglob("*.mcap"))
         if not logs:
-            raise ConfigError(f"{path}: there is no log (*.mcap) in this folder.")
+            raise ConfigError(f"{path}: there is no log (*.mcap) in this folder. Tables are named one by one.")
         found += logs
     return tuple(found)
 
@@ -177,20 +178,6 @@ def spread_table(spreads: Mapping[str, Spread]) -> Table:
         if len(rows[who]) == len(spreads):
             table.add_row(who, *rows[who])
     return table
-
-
-def _fixed(words: Sequence[str]) -> dict[str, float]:
-    """Parameters to be held, from ``name=value``."""
-    found = {}
-    for word in words:
-        name, _, value = word.partition("=")
-        try:
-            found[name.strip()] = float(value)
-        except ValueError:
-            raise click.BadParameter(f"{word!r}: write name=value, as in eps_r=2.8", param_hint="--fix") from None
-        if not math.isfinite(found[name.strip()]):
-            raise click.BadParameter(f"{word!r}: the value is not a number", param_hint="--fix")
-    return found
 
 
 def _stretches(words: str | None) -> tuple[float, float] | None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rig.cli.files import FILE, tell_written
+from rig.cli.fit_options import fix_option, fixed_values
 from rig.cli.import_options import import_options, taken, understood_or_refused, with_import
 
 if TYPE_CHECKING:
@@ -34,6 +35,13 @@ if TYPE_CHECKING:
     show_default=True,
     help="What counts: each test alike, errors in Pa, relative errors, or errors in units of each test's noise.",
 )
+@fix_option
+@click.option(
+    "--negative-exponents/--positive-exponents",
+    default=True,
+    show_default=True,
+    help="Whether an Ogden term may have alpha < 0 (with mu < 0).",
+)
 @click.option("--compare", "comparing", is_flag=True, help="Judge all laws: AICc, prediction of the other modes.")
 @click.option("--predict", multiple=True, type=FILE, help="A test that takes no part and is predicted.")
 @import_options(sheet=True)
@@ -44,6 +52,8 @@ def command(
     law: str,
     terms: int,
     weighting: Any,
+    fixed: tuple[str, ...],
+    negative_exponents: bool,
     comparing: bool,
     predict: tuple[Path, ...],
     dry_run: bool,
@@ -57,7 +67,7 @@ def command(
     first; what cannot be understood is asked for, with the option that tells it. A shared set of options can stand in
     DATA.import.toml beside DATA.csv. The kind of test is in the file, in its name, or in --kind.
     """
-    from rig.analysis.imported import compare_sheets, identify_sheets, read_sheets
+    from rig.analysis.imported import compare_sheets, identify_sheets, read_sheets, sheets_record
     from rig.base.outputs import check_new, write_text
     from rig.cli.show import show
 
@@ -70,10 +80,18 @@ def command(
     if dry_run:
         tell_written(tidy)
         return
-    found = identify_sheets(read, law=law, terms=terms, weighting=weighting)
+    settings: dict[str, Any] = {
+        "law": law,
+        "terms": terms,
+        "weighting": weighting,
+        "fixed": fixed_values(fixed),
+        "negative_exponents": negative_exponents,
+    }
+    found = identify_sheets(read, **settings)
     compared = compare_sheets(read, weighting) if comparing else []
     if out is not None:
-        result = found.to_dict() | ({"compared": [one.to_dict() for one in compared]} if compared else {})
+        result = found.to_dict() | {"provenance": sheets_record(tests, predict, settings)}
+        result |= {"compared": [one.to_dict() for one in compared]} if compared else {}
         write_text(out, with_import(result, read.understood))
     if report is not None:
         from calibration.sheet.report import write_report
@@ -129,6 +147,7 @@ def tests_table(found: TestsFit) -> Group:
         table,
         explained,
         f"convention: {found.law.description}",
+        *(f"held, not fitted: {name} = {value:g}" for name, value in found.fixed.items()),
         *(f"note: {warning}" for warning in found.warnings),
     )
 

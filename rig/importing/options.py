@@ -120,6 +120,27 @@ class ImportOptions:
                 merged[name] = mine if mine not in (None, ()) else theirs
         return replace(self, **merged)
 
+    def to_table(self) -> dict[str, Any]:
+        """What is said here, with the keys and units of `ImportTable`; what is not said is left out."""
+        table = {
+            "column": dict(self.column),
+            "unit": dict(self.unit),
+            "sign": {key: "-" if value < 0.0 else "+" for key, value in self.sign.items()},
+            "zero": {key: "first" if value is None else value for key, value in self.zero.items()},
+            "factor": dict(self.factor),
+            "kind": self.kind,
+            "area_mm2": None if self.area is None else _before(self.area, 1e-6),
+            "length_mm": None if self.length is None else _before(self.length, 1e-3),
+            "voltage_V": list(self.voltage),
+            "rows": [f"{low}-{high}" for low, high in self.rows],
+            "branch": self.branch,
+            "specimen": list(self.specimen),
+            "separator": self.separator,
+            "decimal": self.decimal,
+            "encoding": self.encoding,
+        }
+        return {key: value for key, value in table.items() if value not in (None, {}, [])}
+
 
 def from_words(
     *,
@@ -199,6 +220,12 @@ def from_file(path: Path) -> ImportOptions:
         )
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def _before(value: float, factor: float) -> float:
+    """The number that makes ``value`` to the last bit when it is multiplied by ``factor``."""
+    near = (round(value / factor, 12), value / factor)
+    return next((one for one in near if one * factor == value), near[1])
 
 
 def _pairs(words: Iterable[str], option: str) -> list[tuple[str, str]]:

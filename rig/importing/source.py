@@ -50,7 +50,9 @@ def open_source(path: Path, options: ImportOptions) -> Source:
     options = options.over(stored)
     text = read_text(path, options.encoding)
     findings = Findings(str(path))
-    understood = Understood(str(path), options_file=str(stored_in or ""), findings=findings.all)
+    understood = Understood(
+        str(path), options_file=str(stored_in or ""), options=options.to_table(), findings=findings.all
+    )
     table = find_table(text, findings, options.separator, options.decimal)
     source = Source(path, table, options, findings, understood)
     if table is not None:

@@ -24,6 +24,7 @@ class Understood:
     heading_line: int | None = None
     unit_line: int | None = None
     options_file: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
     kind: str = ""
     kind_source: str = ""
     use: dict[int, str] = field(default_factory=dict)
@@ -73,6 +74,7 @@ class Understood:
             "heading_line": self.heading_line,
             "unit_line": self.unit_line,
             "options_file": self.options_file or None,
+            "options": self.options,
             "kind": self.kind or None,
             "kind_from": self.kind_source or None,
             "columns": {

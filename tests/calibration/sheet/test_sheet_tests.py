@@ -9,6 +9,7 @@ import pytest
 from calibration.sheet.fit import cross_prediction, fit_tests
 from calibration.sheet.problem import SheetProblem, nominal_stress, r_squared
 from calibration.sheet.sheet_tests import HomogeneousTest, TestsError
+from model.material.gent import Gent
 from rig.importing.sheet_table import read_sheet_tests
 
 # Published test data, kept beside the project; without it the tests on it are skipped.
@@ -257,3 +258,26 @@ def test_what_is_identified_stands_under_another_weighting(files: list[str], ter
             if quantity.verdict == "identified":
                 for other in fits.values():
                     assert abs(other[name].value - quantity.value) <= 2.0 * quantity.uncertainty, name
+
+
+def test_what_is_fixed_is_held_and_the_rest_is_found() -> None:
+    """Two terms of which one exponent is known; a shape that the law has not is refused; signs can be forbidden."""
+    stretch = np.linspace(1.05, 2.5, 20)
+    stress = 3e4 * (stretch**2 - stretch**-1) / stretch + 200.0 * (stretch**6.5 - stretch**-3.25) / stretch
+    nothing = np.full(stretch.size, np.nan)
+    test = HomogeneousTest("exact", "uniaxial", stretch, stretch**-0.5, stress, nothing)
+    found = fit_tests([test], terms=2, fixed={"alpha1": 6.5})
+    assert found.alpha[0] == 6.5 and found.alpha[1] == pytest.approx(2.0, rel=1e-3)
+    assert found.mu == pytest.approx((200.0, 3e4), rel=1e-3)
+    assert set(found.quantities) == {"mu1", "mu2", "alpha2", "G"} and found.to_dict()["fixed"] == {"alpha1": 6.5}
+    both = fit_tests([test], terms=2, fixed={"alpha1": 2.0, "alpha2": 6.5})
+    assert both.mu == pytest.approx((3e4, 200.0), rel=1e-6)
+    gent = fit_tests([test], law=Gent, fixed={"Jm": 30.0})
+    assert gent.alpha == (30.0,) and set(gent.quantities) == {"mu", "G"}
+    with pytest.raises(TestsError, match="cannot fix alpha3; what can be fixed is alpha1, alpha2"):
+        fit_tests([test], terms=2, fixed={"alpha3": 2.0})
+    with pytest.raises(TestsError, match=r"it lies between 0\.05 and 30"):
+        fit_tests([test], terms=1, fixed={"alpha1": 40.0})
+    falling = HomogeneousTest("falls", "uniaxial", stretch, stretch**-0.5, 5e4 * (1.0 - stretch**-3), nothing)
+    assert fit_tests([falling], terms=1).alpha[0] < 0.0
+    assert fit_tests([falling], terms=1, negative_exponents=False).alpha[0] > 0.0

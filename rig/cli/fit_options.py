@@ -1,0 +1,30 @@
+"""Options that all fits share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import click
+
+fix_option = click.option(
+    "--fix",
+    "fixed",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Hold a parameter that is known: alpha1=2, Jm=40, of a cone eps_r=2.8. May be repeated.",
+)
+
+
+def fixed_values(words: Sequence[str]) -> dict[str, float]:
+    """Parameters to be held, from ``name=value``."""
+    found = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            raise click.BadParameter(f"{word!r}: write name=value, as in alpha1=2", param_hint="--fix") from None
+        if not math.isfinite(found[name.strip()]):
+            raise click.BadParameter(f"{word!r}: the value is not a number", param_hint="--fix")
+    return found
