@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from rig.base.errors import ConfigError
 from rig.base.terminal import tell
 from rig.log.contents import bench_word
 from rig.operator.display import Display
-from rig.protocol.experiment import Experiment
+from rig.protocol.experiment import Experiment, prepare
 from rig.run.run import Consent
 from rig.run.run import run as run_experiment
+
+
+def prepare_step(scene: Path, title: str, step: Mapping[str, Any], ports: dict[str, Any] | None) -> Experiment:
+    """The experiment that is a single step of these keys."""
+    with TemporaryDirectory(prefix="dea-rig-") as folder:
+        steps = Path(folder) / f"{step['do']}.toml"
+        lines = [f'title = "{title}"', "", "[[step]]", *(f"{key} = {json.dumps(value)}" for key, value in step.items())]
+        steps.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return prepare(scene, steps, ports)
 
 
 def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, take_down: bool) -> None:

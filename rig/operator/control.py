@@ -24,10 +24,14 @@ HELP = "Type p to pause, c to continue, s to stop (and Enter); Ctrl-C stops too.
 
 @dataclass(frozen=True)
 class Question:
-    """What the operator is asked. ``expected`` is what has to be typed, letter by letter; empty: anything will do."""
+    """What the operator is asked.
+
+    ``expected`` is what has to be typed, letter by letter; empty: anything will do. ``hint`` says what may be typed.
+    """
 
     text: str
     expected: str = ""
+    hint: str = ""
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,9 @@ class Control(StopRequest):
         if self.unattended:
             self.answer = Answer(question.expected or "yes", self.unattended)
             return
-        wanted = f"type {question.expected}" if question.expected else "press Enter, or type a remark for the log"
+        wanted = question.hint or (
+            f"type {question.expected}" if question.expected else "press Enter, or type a remark for the log"
+        )
         self.say(f"{question.text}\n  -> {wanted}; or s to stop. From another terminal: dea-rig continue")
 
     def withdraw(self) -> None:

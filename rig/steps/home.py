@@ -37,10 +37,15 @@ class Homing(Action):
     """The stage's own search for its reference."""
 
     def carry_out(self, rig: Rig) -> Turns:
-        stage = rig.bench.stage
-        rig.command("stage", "home", "")
-        rig.recorder.speed = 0.0  # the device's own, not known here
-        stage.home()
-        yield from wait(rig, lambda: not stage.moving, HOMING_LIMIT_S, "The end of the stage's homing")
-        if not stage.referenced:
-            raise FaultError("stage: homing ended, but the stage still reports no reference position.")
+        yield from find_reference(rig)
+
+
+def find_reference(rig: Rig) -> Turns:
+    """Let the stage look for its reference position, and wait until it says that it has one."""
+    stage = rig.bench.stage
+    rig.command("stage", "home", "")
+    rig.recorder.speed = 0.0  # the device's own, not known here
+    stage.home()
+    yield from wait(rig, lambda: not stage.moving, HOMING_LIMIT_S, "The end of the stage's homing")
+    if not stage.referenced:
+        raise FaultError("stage: homing ended, but the stage still reports no reference position.")

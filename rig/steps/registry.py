@@ -23,6 +23,7 @@ from rig.steps.follow import Follow
 from rig.steps.glide import Glide
 from rig.steps.hold import Hold
 from rig.steps.home import Home
+from rig.steps.jog import Jog
 from rig.steps.meter import Meter
 from rig.steps.mount import Mount
 from rig.steps.precondition import Precondition
@@ -64,6 +65,7 @@ OWN: Mapping[str, type[Step]] = {
         Glide,
         Press,
         Meter,
+        Jog,
     )
 }
 

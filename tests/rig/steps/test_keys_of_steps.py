@@ -56,6 +56,7 @@ LEAST: dict[str, tuple[str, dict[str, Any]]] = {
     "glide": ("homed", {"from_mm": 1.0, "to_mm": 3.0, "speeds_mm_per_s": [1.0, 2.0]}),
     "press": ("homed", {"force_N": 0.5}),
     "meter": ("nothing", {"voltages_V": [0.0, 500.0]}),
+    "jog": ("nothing", {"moves": ["20", "+1"]}),
 }
 DEFAULTS: dict[str, dict[str, Any]] = {
     "home": {},
@@ -99,6 +100,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "meter_relative_uncertainty": 5e-4,
         "meter_uncertainty_V": 0.5,
     },
+    "jog": {"moves": [], "step_mm": 0.1, "speed_mm_per_s": 1.0},
 }
 # Another value of a key, and what of the actions it moves: names of fields; "number" of actions.
 MOVES: dict[str, dict[str, tuple[Any, set[str]]]] = {
@@ -191,6 +193,11 @@ MOVES: dict[str, dict[str, tuple[Any, set[str]]]] = {
         "meter_relative_uncertainty": (1e-3, {"relative_error"}),
         "meter_uncertainty_V": (0.6, {"applied_error"}),
     },
+    "jog": {
+        "moves": (["21", "read"], {"label", "move", "duration"}),
+        "step_mm": (0.2, {"length"}),
+        "speed_mm_per_s": (2.0, {"speed"}),
+    },
 }
 TINY = 1e-9
 # Values that are just allowed, and values just beyond.
@@ -266,6 +273,11 @@ BOUNDS: dict[str, dict[str, tuple[list[Any], list[Any]]]] = {
         "voltages_V": STANDARDS,
         "meter_relative_uncertainty": NOT_NEGATIVE,
         "meter_uncertainty_V": NOT_NEGATIVE,
+    },
+    "jog": {
+        "moves": ([[], ["home"] * 200, ["+.5", "-2", "20."]], [["home"] * 201, [""], ["up"], ["1e3"], ["1,5"]]),
+        "step_mm": POSITIVE,
+        "speed_mm_per_s": POSITIVE,
     },
 }
 KEYS = [(do, key) for do, keys in MOVES.items() for key in keys]
@@ -365,7 +377,7 @@ def test_the_facts_of_a_step_are_those_of_its_actions(do: str, scene: Any) -> No
     assert any(one.record for one in actions) is step.records
     assert all(one.by.kind == do for one in actions)
     assert max(level for one in actions for level in one.voltage) <= max(actions[0].by.highest_voltage, 100.0)
-    asks = {"prompt", "mount", "weigh"}  # whoever is asked to do something there touches the rig
+    asks = {"prompt", "mount", "weigh", "jog"}  # whoever is asked to do something there touches the rig
     assert step.hands is (do in asks)
     assert step.needs_contact is (do in {"precondition", "ramp", "voltage", "sweep", "follow"})
     assert step.finds_contact is (do == "approach")
