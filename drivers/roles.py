@@ -10,7 +10,7 @@ SI units throughout: metres, newtons, volts, amperes, seconds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Flag, auto
 from typing import Protocol, runtime_checkable
@@ -150,6 +150,36 @@ class Stage(Device, Protocol):
 
     def stop(self) -> None:
         """Decelerate to a standstill; overtakes everything queued."""
+        ...
+
+
+@runtime_checkable
+class GivesBack(Protocol):
+    """A device that changes settings of its own for what it is told to do, and puts them back.
+
+    ``found`` holds them as set-up found them, by name; set-up itself changes none. ``given_back`` is True while the
+    device has confirmed that all of them are as in ``found``; `close` puts back the rest without waiting.
+    """
+
+    name: str
+    identity: Identity
+    found: dict[str, int]
+
+    @property
+    def given_back(self) -> bool: ...
+
+    @property
+    def next_poll(self) -> float: ...
+
+    def resume_found(self, found: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+        """Take over what an earlier run found that ended without giving it back: by name what is now and was before.
+
+        Nothing, where the device shows that somebody has put it right since.
+        """
+        ...
+
+    def give_back(self) -> None:
+        """Put every setting back to what was found, after what is queued."""
         ...
 
 

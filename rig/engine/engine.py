@@ -20,6 +20,7 @@ from drivers.roles import HVSample, Sample
 from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.base.host import HostTime
 from rig.bench.bench import Bench
+from rig.engine.lent import Lent
 from rig.engine.look import Outlook
 from rig.engine.outcome import NOT_SAFE_STATUS, Outcome
 from rig.engine.pause import pause
@@ -116,6 +117,7 @@ class Engine:
         self._show_status = show
         self._outlook = Outlook(self.rig, actions, max((action.step for action in actions), default=0))
         self._host = HostTime(self.clock)
+        self._lent = Lent(bench, self.recorder)
         self._beats = 0
         self._next_beat = -math.inf
         self._watch: Watch | None = None
@@ -165,6 +167,7 @@ class Engine:
             self._next_turn,
             ended + SNAPSHOT_S - ROUNDING_S if snapshot else ended,
         )
+        self._lent.end(rest.standing)
         if isinstance(error, Stopped):  # not before: a log that fails now stops nothing
             self.recorder.operator("stops", "", self.control.source)
         if snapshot:
@@ -239,6 +242,7 @@ class Engine:
                 f"force: the certificate is for readings in {self.gains.force_unit}, but the instrument gives them in "
                 f"{unit}. Use the instrument's own certificate. Nothing was moved and no output changed."
             )
+        self._lent.begin()
         self._check_devices()
         self._check_output()
 

@@ -6,12 +6,14 @@ Every sample is judged as it comes in; once a turn the ages of all, and what two
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from itertools import pairwise
 
 from drivers.roles import DisplacementSample, ForceSample, HVFlag, HVSample, Sample, StageSample
 from rig.base.errors import FaultError, StaleData
 from rig.bench.bench import Bench
+from rig.engine.follows import ForceFollows
 from rig.log.recorder import Recorder
 from rig.safety.guard import SAFE_VOLTAGE, AnyGuard, GuardState, flag_names
 from rig.safety.limits import ZERO_PART, Limits
@@ -52,6 +54,7 @@ class Watch:
         self._last_turn = bench.clock.now()
         self._agreed = -math.inf
         self._seen_off = False
+        self._follows = ForceFollows(bench.scene, limits)
 
     def sample(self, role: str, sample: Sample, now: float) -> None:
         """Judge one sample, as the recorder gave it back."""
@@ -63,6 +66,7 @@ class Watch:
                 if self._good(role, sample):
                     self._judge_frozen(role, sample.reading)
                     self._judge_force(sample)
+                    self._judge_following(sample)
             case DisplacementSample():
                 if self._good(role, sample):
                     self._judge_frozen(role, sample.displacement)
@@ -104,6 +108,8 @@ class Watch:
         chance = (equal + 1) / (len(readings) + 1)  # that the next one is equal, never quite 0 or 1
         longest = math.log(FROZEN_ODDS) / -math.log(chance)
         self._frozen[role] = max(math.ceil(longest), FROZEN_FEWEST)
+        if role == "force":
+            self._follows.learn(statistics.pstdev(map(self._recorder.from_stored_zero, readings)))
 
     def _judge_frozen(self, role: str, reading: float) -> None:
         self._equal[role] = self._equal[role] + 1 if reading == self._last_reading[role] else 0
@@ -126,6 +132,15 @@ class Watch:
             limit.check(recorder.quantity_of(sample), "Force measured")
         allowed = limit if recorder.has_stored_zero else limit.widened(1 + ZERO_PART)
         allowed.check(recorder.from_stored_zero(sample.reading), "Force measured, against the stored zero")
+
+    def _judge_following(self, sample: ForceSample) -> None:
+        """In contact with the film only; the samples of a zero step are not."""
+        recorder = self._recorder
+        if not (math.isfinite(recorder.contact) and math.isfinite(recorder.force_zero)):
+            self._follows.restart()
+            return
+        volts = 0.0 if recorder.hv is None else abs(recorder.hv.voltage)
+        self._follows.sample(recorder.quantity_of(sample), recorder.displacement, volts)
 
     def _judge_output(self, sample: HVSample) -> None:
         """A supply whose guard is SAFE must stay off, once it has been measured off."""

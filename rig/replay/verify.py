@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from drivers.links.link import DeviceError
-from drivers.roles import HVSupply, Renewed, Stage
+from drivers.roles import GivesBack, HVSupply, Renewed, Stage
 from drivers.settings import CanSettings
 from rig.bench.bench import Bench
 from rig.bench.opening import open_memory
@@ -385,10 +385,18 @@ def commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]], 
     def stage() -> Stage:
         return bench.stage
 
+    def lender() -> GivesBack:
+        return cast(GivesBack, bench.stage)
+
+    def resume_found(values: Sequence[float]) -> None:
+        lender().resume_found(dict(zip(lender().found, map(int, values), strict=True)))
+
     return {
         ("stage", "home"): lambda values: stage().home(),
         ("stage", "move_to"): lambda values: stage().move_to(values[0], values[1]),
         ("stage", "stop"): lambda values: stage().stop(),
+        ("stage", "resume_found"): resume_found,
+        ("stage", "give_back"): lambda values: lender().give_back(),
         ("hv", "arm"): arm,
         ("hv", "take_down"): take_down,
         ("hv", "clear"): lambda values: supply().clear(),

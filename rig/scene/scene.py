@@ -74,6 +74,15 @@ class LimitsTable(Table):
         "Typical: 0.5 to 10.",
         json_schema_extra={"usual": [0.01, 500]},
     )
+    force_model_factor: float = Field(
+        default=10.0,
+        gt=1.0,
+        le=1e6,
+        description="How many times less or more than the model of the film says the measured force may change while "
+        "the film moves; beyond it the run ends. Default 10: only a frozen load cell, a torn film or a disk that does "
+        "not touch is outside. From about 1000 on nothing is judged. Typical: 3 to 10.",
+        json_schema_extra={"usual": [1.5, 1e6]},
+    )
 
 
 class BenchTable(Table):

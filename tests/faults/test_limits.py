@@ -269,3 +269,42 @@ def test_how_many_equal_readings_mean_frozen_is_learnt_from_the_sensors_own_nois
         readings = [round(math.sin(7.0 * k) / coarse) * coarse for k in range(1000)]
         watch.learn("force", readings)
         assert expected <= watch._frozen["force"] <= expected + 12
+
+
+@pytest.mark.parametrize(
+    "scale", [0.0, pytest.param(-1.0, marks=pytest.mark.slow), pytest.param(0.03, marks=pytest.mark.slow)]
+)
+def test_a_force_that_does_not_follow_the_film_ends_the_run(tell: Tell, scale: float) -> None:
+    """A load cell that stands still, or nearly, or goes the other way; its noise is as ever."""
+
+    def freeze(bench: SimulatedBench, control: Control) -> None:
+        twin: Any = bench.instruments["force"]
+        true, at = twin._bridge, twin._bridge(bench.now)
+        twin._bridge = lambda t: at + scale * (true(t) - at)
+
+    story = tell(freeze)
+    assert isinstance(story.error, FaultError) and "does not follow the film" in str(story.error), story.error
+    assert "limits.force_model_factor = 10" in str(story.error)
+    # The stage was stopped on its way, and the voltage is gone.
+    assert story.bench.world.stage.at(story.end)[0] - CONTACT_MM * 1e-3 < 5.5e-3
+    assert abs(story.final_output) < 60 and story.outcome.safe
+
+
+@pytest.mark.parametrize("times", [pytest.param(0.25, marks=pytest.mark.slow), 4.0])
+def test_a_film_four_times_softer_or_stiffer_than_believed_is_still_a_film(tell: Tell, times: float) -> None:
+    def scale(bench: SimulatedBench, control: Control) -> None:
+        twin: Any = bench.instruments["force"]
+        true, at = twin._bridge, twin._bridge(bench.now)
+        twin._bridge = lambda t: at + times * (true(t) - at)
+
+    assert "does not follow" not in str(tell(scale).error)
+
+
+def test_a_wide_factor_switches_the_comparison_off(tell: Tell) -> None:
+    def freeze(bench: SimulatedBench, control: Control) -> None:
+        twin: Any = bench.instruments["force"]
+        at = twin._bridge(bench.now)
+        twin._bridge = lambda t: at
+
+    story = tell(freeze, replace=("[limits]", "[limits]\nforce_model_factor = 1000.0"))
+    assert story.error is None, story.error

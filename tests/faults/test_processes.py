@@ -11,6 +11,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -87,6 +88,34 @@ def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
     assert commands(live)[-1] == "emergency_off"
     last = read_log(part).columns("/hv/sample")["voltage_V"][-2:]
     assert (abs(last) < 60.0).all()
+
+
+@pytest.mark.slow
+def test_the_stage_gets_back_after_a_kill_what_it_had_lent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with Stand(tmp_path / "stand", hold_s=0.2) as stand:
+
+        def settings() -> dict[str, int]:
+            values: dict[str, int] = stand.do(lambda bench: dict(cast(Any, bench.instruments["stage"])._values))
+            return values
+
+        found = settings()
+        run = stand.start()
+        stand.wait_until_live(run)
+        stand.kill(run.engine)
+        stand.wait_until_alone(run)
+        assert settings()["knob.enable"] == 0 and settings()["maxspeed"] != found["maxspeed"]
+        assert len(list((tmp_path / "dea-rig").glob("stage-*.json"))) == 1
+        for _ in range(TRIES):
+            run = stand.start()
+            stand.wait_until_alone(run)
+            if run.status == 0:
+                break
+        assert run.status == 0, run.said
+        assert settings() == found
+        assert not list((tmp_path / "dea-rig").glob("stage-*.json"))
+        told = [m.fields["message"] for m in read_log(run.log).messages("/event") if m.fields["source"] == "stage"]
+        assert any("an earlier run was killed and left changed" in text for text in told), told
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ The instruments move in virtual time. The film is not asked: nothing here touche
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
@@ -236,3 +237,107 @@ def test_laser_that_sees_nothing_says_so_on_every_sample(
     rig.values.clear()
     rig.run(0.2)
     assert not any(sample.flags for sample in rig.values[1:]) and not rig.errors
+
+
+# What the stage lends ------------------------------------------------------------------------------------------------
+
+
+class Found:
+    """A stage of two axes with settings of its owner's, told what to do over its wire."""
+
+    def __init__(self, **truth: object) -> None:
+        settings = SimulationSettings(
+            seed=1,
+            rig_compliance_um_per_N=0.0,
+            stage=ZaberTruth(start_position_mm=0.0, referenced_at_start=True, axes=2, **truth),  # type: ignore[arg-type]
+        )
+        self.bench = SimulatedBench(settings, SPECIMEN, {"stage"})
+        self.clock = VirtualClock(self.bench.advance)
+        self.twin: Any = self.bench.instruments["stage"]
+        self.at_first = self.twin_settings()
+
+    def twin_settings(self) -> tuple[dict[str, int], list[dict[str, int]]]:
+        return dict(self.twin._values), [dict(other) for other in self.twin.others]
+
+    def connect(self) -> ZaberStage:
+        wire = self.bench.wire("stage")
+        assert isinstance(wire, ByteWire)
+        stage = ZaberStage("stage", MemoryByteLink("stage", wire, self.clock))
+        self.run(stage, 0.2)
+        assert stage.ready
+        return stage
+
+    def run(self, stage: ZaberStage, seconds: float) -> None:
+        end = self.clock.now() + seconds
+        while self.clock.now() < end:
+            self.clock.sleep_until(min(end, max(stage.next_poll, self.clock.now() + 1e-4)))
+            stage.poll(self.clock.now())
+
+
+@pytest.mark.parametrize("when_set", [False, True])
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_the_stage_gets_back_what_it_lent_and_other_axes_are_left_alone(when_set: bool, confirmed: bool) -> None:
+    found = Found(checksums_when_set=when_set)
+    stage = found.connect()
+    assert found.twin_settings() == found.at_first  # connecting changes nothing
+    stage.move_to(1e-3, 2e-3)
+    found.run(stage, 0.2)
+    own, others = found.twin_settings()
+    assert own["knob.enable"] == 0 and own["maxspeed"] == pytest.approx(6605, abs=2)
+    assert own["comm.checksum"] == int(when_set)
+    assert others == found.at_first[1]
+    if confirmed:
+        found.run(stage, 2.0)
+        stage.give_back()
+        found.run(stage, 0.2)
+        assert stage.given_back and found.twin_settings() == found.at_first
+    stage.close()
+    found.clock.sleep_until(found.clock.now() + 0.1)
+    assert found.twin_settings() == found.at_first
+
+
+def test_a_knob_that_was_disabled_stays_so() -> None:
+    found = Found()
+    found.twin._values["knob.enable"] = 0
+    stage = found.connect()
+    stage.move_to(1e-3, 2e-3)
+    found.run(stage, 2.0)
+    stage.give_back()
+    found.run(stage, 0.2)
+    stage.close()
+    found.clock.sleep_until(found.clock.now() + 0.1)
+    assert found.twin._values["knob.enable"] == 0 and found.twin._values["maxspeed"] == found.at_first[0]["maxspeed"]
+
+
+def test_what_a_killed_run_left_is_given_back_by_the_next_one() -> None:
+    found = Found(checksums_when_set=True)
+    killed = found.connect()
+    killed.move_to(1e-3, 2e-3)
+    found.run(killed, 2.0)  # and it is never heard of again
+    kept = dict(killed.found)
+    stage = found.connect()
+    left = stage.resume_found(kept)
+    assert left.keys() == {"knob.enable", "maxspeed", "comm.checksum"} and left["knob.enable"] == (0, 1)
+    stage.give_back()
+    found.run(stage, 0.2)
+    assert stage.given_back and found.twin_settings() == found.at_first
+    assert found.connect().resume_found(kept) == {}  # what is right again is left alone
+
+
+@pytest.mark.parametrize("serial", [50_443, 50_444])
+def test_two_stages_with_one_address_are_refused_before_anything_moves(serial: int) -> None:
+    """By what they answer, or, where both say the same, by answering everything twice."""
+    found, other = Found(), Found(serial_number=serial)
+    one = found.twin.receive
+
+    def both(data: bytes, t: float) -> None:
+        one(data, t)
+        other.twin.receive(data, t)
+
+    other.twin._wire = found.twin._wire
+    found.twin.receive = both
+    with pytest.raises(DeviceRefused, match="two devices have the address 1") as caught:
+        found.connect()
+    assert ("'50443' and '50444'" in str(caught.value)) is (serial == 50_444)
+    assert found.twin_settings() == found.at_first and other.twin_settings() == other.at_first
+    assert found.bench.world.stage.at(found.clock.now())[0] == 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
@@ -23,10 +23,14 @@ from drivers.instruments.zaber.codec import (
     Reply,
     encode,
 )
+from drivers.instruments.zaber.second import SecondDevice
 from drivers.links.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import Identity, StageSample
 
 T = TypeVar("T")
+
+FACTS = ("resolution", "limit.min", "limit.max", "accel")
+CHANGED = -1  # of a setting: it was written, and not yet said to be taken
 
 
 class _Command(NamedTuple):
@@ -45,8 +49,13 @@ class ZaberStage:
     """A `drivers.roles.Stage` on one axis of a Zaber device.
 
     Set-up reads identity, resolution, travel and speed from the device, clears old warnings (kept in
-    ``settings["warnings_at_start"]``), locks the manual knob until `close`, and asks a device that answers without
-    checksums to send them from now on. After that the position is polled.
+    ``settings["warnings_at_start"]``) and changes no setting; then the position is polled. Before its first motion
+    the driver locks the manual knob of its own axis and asks a device that answers without checksums to send them;
+    motions set the axis's speed. What it will change is in ``found`` as set-up found it, and is put back by `give_back`
+    and by `close`.
+
+    Two devices with one address answer everything twice and move together: they are refused in set-up, or at the latest
+    before the first motion.
 
     The stage refuses to move while it has no reference (warning flags WR, WH). When a reference it had is gone, most
     likely because the device restarted, `poll` raises `DeviceRefused`; so it does, once, for each fault flag that
@@ -118,8 +127,11 @@ class ZaberStage:
         self._travel_steps = (0, 0)
         self._acceleration = math.nan  # m/s^2
         self._raw = 0
-        self._max_speed = self._max_speed_at_start = 0
-        self._knob_locked = False
+        self.found: dict[str, int] = {}
+        self._present: dict[str, int] = {}  # the same settings as they are now
+        self._held = False  # whether what it needs for motions has been set
+        self._facts: dict[str, int] = {}  # numbers read in set-up that nothing should change
+        self._second = SecondDevice(self._label, device)
         self._dialogue.begin(self._set_up())
 
     @property
@@ -195,6 +207,26 @@ class ZaberStage:
         """Stop at once, without the deceleration ramp; overtakes everything queued."""
         self._halt("estop")
 
+    @property
+    def given_back(self) -> bool:
+        """Whether every setting is as it was found, by the device's own word."""
+        return self._present == self.found
+
+    def resume_found(self, found: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+        """Take over what an earlier run found; a knob that is enabled again shows that it was put right since."""
+        if found.get("knob.enable") == 1 and self._present.get("knob.enable") == 1:
+            return {}
+        left = {key: (self._present[key], value) for key, value in found.items() if key in self._present}
+        left = {key: (now, before) for key, (now, before) in left.items() if now != before and before >= 0}
+        self.found.update({key: before for key, (_, before) in left.items()})
+        return left
+
+    def give_back(self) -> None:
+        """Set every setting back to what it was found as, when all that is queued has been done."""
+        if self._ready and not self.given_back:
+            self._dialogue.begin(self._giving_back())
+            self._next_poll = self._now
+
     def poll(self, now: float) -> Sequence[StageSample]:
         self._now = now
         try:
@@ -217,22 +249,21 @@ class ZaberStage:
         return samples
 
     def close(self) -> None:
-        """Stop if moving, give knob and speed back, all without waiting for replies, and release the line."""
+        """Stop if moving, give settings back that were changed, all without waiting, and release the line."""
         if self._closed:
             return
         self._closed = True
         with contextlib.suppress(DeviceError):
             if self.moving:
                 self._send(_Command("stop", self._axis))
-            if self._max_speed != self._max_speed_at_start:
-                self._send(_Command(f"set maxspeed {self._max_speed_at_start}", self._axis))
-            if self._knob_locked:
-                self._send(_Command("set knob.enable 1", 0))
+            for key in self._changed():
+                self._send(_Command(f"set {key} {self.found[key]}", self._axis_of(key)))
         self._link.close()
 
     def _send(self, command: _Command) -> Callable[[Reply], bool]:
         self._message_id = (self._message_id + 1) % 100
         expected = (self._device, command.axis, self._message_id)
+        self._second.asked(expected, command.words)
         self._link.write(encode(self._device, command.axis, self._message_id, command.words))
         return lambda reply: (reply.device, reply.axis, reply.id) == expected
 
@@ -242,22 +273,21 @@ class ZaberStage:
             self._schedule.start(now)  # something has changed: look at once
         elif isinstance(message, Info):
             self.counters["infos"] += 1
-        elif not (self._urgent.offer(message, now) or self._dialogue.offer(message, now)):
+        elif self._urgent.offer(message, now) or self._dialogue.offer(message, now):
+            self._second.answered(message)
+        else:
             self.counters["unexpected_replies"] += 1
+            self._second.heard_again(message)
 
     def _set_up(self) -> Script[_Command, Reply]:
         yield from self._ask("", axis=0)
-        if not self._codec.checksums_seen:
-            yield from self._ask("set comm.checksum 1", axis=0, may_fail=True)
         device_id = yield from self._number("get deviceid", axis=0)
         serial = yield from self._number("get system.serial", axis=0)
         version = (yield from self._ask("get version", axis=0)).message.data
         self.identity = Identity(model=f"Zaber device {device_id}", serial=str(serial), firmware=version)
-        resolution = yield from self._number("get resolution")
-        low = yield from self._number("get limit.min")
-        high = yield from self._number("get limit.max")
+        self._facts = yield from self._read_facts()
+        resolution, low, high, acceleration = (self._facts[key] for key in FACTS)
         max_speed = yield from self._number("get maxspeed")
-        acceleration = yield from self._number("get accel")
         if not (resolution > 0 and low < high and max_speed > 0 and acceleration >= 0):
             raise DeviceRefused(
                 self._label,
@@ -268,15 +298,18 @@ class ZaberStage:
         self._step = self._full_step / resolution
         self._travel_steps = (low, high)
         self._acceleration = acceleration * 1e4 / VELOCITY_UNIT * self._step
-        self._max_speed = self._max_speed_at_start = max_speed
+        self.found = {"maxspeed": max_speed}
+        for key in ("knob.enable", "comm.checksum"):
+            answer = (yield from self._ask(f"get {key}", axis=self._axis_of(key), may_fail=True)).message
+            if answer.accepted and WHOLE.fullmatch(answer.data):
+                self.found[key] = int(answer.data)
+        self._present = dict(self.found)
         # What is only history is cleared now, so that it is not blamed on this run; what is still there is the state.
         yield from self._read_flags()
         old_flags = self._flags
         if old_flags:
             yield from self._ask("warnings clear")
             yield from self._read_flags()
-        knob = (yield from self._ask("set knob.enable 0", axis=0, may_fail=True)).message
-        self._knob_locked = knob.accepted
         self.settings |= {
             "deviceid": str(device_id),
             "serial": str(serial),
@@ -288,11 +321,57 @@ class ZaberStage:
             "maxspeed": str(max_speed),
             "accel": str(acceleration),
             "warnings_at_start": " ".join(old_flags),
-            "knob": "locked" if knob.accepted else f"not locked: {knob.data}",
+            "knob": {0: "disabled", 1: "enabled"}.get(self.found.get("knob.enable", -1), "none"),
             "reply_checksums": "yes" if self._codec.checksums_seen else "no",
         }
+        self._second.judge_all()
         self._schedule.start(self._now)
         self._ready = True
+
+    def _read_facts(self) -> _Part[dict[str, int]]:
+        facts = {}
+        for key in FACTS:
+            facts[key] = yield from self._number(f"get {key}")
+        return facts
+
+    def _take_hold(self) -> _Part[None]:
+        """Set what motions need, once: replies with checksums, and nobody at the knob of this axis."""
+        if self._held:
+            return
+        if self._present.get("comm.checksum") == 0 and not self._codec.checksums_seen:
+            yield from self._change("comm.checksum", 1)
+            self.settings["reply_checksums"] = "yes" if self._codec.checksums_seen else "no"
+            again = yield from self._read_facts()
+            if again != self._facts:
+                raise DeviceRefused(
+                    self._label,
+                    f"its settings were read as {self._facts} without checksums and are {again} with them",
+                    "The line is bad: check cable and adapter. Nothing was moved.",
+                )
+        if self._present.get("knob.enable") == 1:
+            yield from self._change("knob.enable", 0)
+        self._held = True
+
+    def _giving_back(self) -> Script[_Command, Reply]:
+        self._held = False
+        for key in self._changed():
+            yield from self._change(key, self.found[key])
+
+    def _changed(self) -> list[str]:
+        """Which settings are not as they were found; checksums last, since they guard the others."""
+        return [key for key, value in self.found.items() if self._present[key] != value]
+
+    def _change(self, key: str, value: int) -> _Part[None]:
+        """One that is not known to have been taken counts as changed."""
+        present, self._present[key] = self._present[key], CHANGED
+        if key == "comm.checksum" and value == 0:
+            self._codec.checksums_seen = False  # its very answer may have none
+        reply = (yield from self._ask(f"set {key} {value}", axis=self._axis_of(key), may_fail=True)).message
+        self._present[key] = value if reply.accepted else present
+
+    def _axis_of(self, key: str) -> int:
+        """How the line works is a setting of the device, everything else one of the axis."""
+        return 0 if key.startswith("comm.") else self._axis
 
     def _watch(self) -> Script[_Command, Reply]:
         """One position; and all flags when the one shown is not the first of those known, or motion has ended."""
@@ -319,13 +398,15 @@ class ZaberStage:
         assert self._next_motion is not None
         (words, max_speed), self._next_motion = self._next_motion, None
         try:
+            yield from self._take_hold()
             if not self._keeps_going(words):
                 yield from self._check_reference(words)
                 if self._flags:
                     yield from self._ask("warnings clear")
-            if max_speed is not None and max_speed != self._max_speed:
+            if max_speed is not None and max_speed != self._present["maxspeed"]:
+                self._present["maxspeed"] = CHANGED
                 yield from self._ask(f"set maxspeed {max_speed}")
-                self._max_speed = max_speed
+                self._present["maxspeed"] = max_speed
             was_busy = self._busy
             try:
                 answer = yield from self._ask(words, repeat=False)

@@ -57,6 +57,10 @@ class ZaberTruth(StageTruth, LineTruth):
     homing_speed_mm_per_s: Positive = Field(default=10.0, description="Speed at which it homes (mm/s).")
     reboot_s: Positive = Field(default=0.5, description="How long it is silent after power comes back (s).")
     unhomed_reject: str = Field(default="BADDATA", description="Reject word for a move before homing.")
+    axes: int = Field(default=1, ge=1, le=9, description="How many axes it has; the disk is on the first.")
+    checksums_when_set: bool = Field(
+        default=False, description="Whether only its setting comm.checksum makes it answer with checksums."
+    )
 
 
 class ZaberStage:
@@ -105,6 +109,9 @@ class ZaberStage:
             "knob.enable": 1,
             "comm.address": s.device_address,
         }
+        # Of the axes that drive nothing: what can be set of each by itself.
+        own = {name: value for name, value in self._values.items() if not name.startswith("comm.")}
+        self.others = [dict(own) for _ in range(s.axes - 1)]
         self._power_up(0.0)
         if settings.referenced_at_start:
             self._origin = 0.0
@@ -206,8 +213,10 @@ class ZaberStage:
         identifier = numbers[2] if len(numbers) > 2 else ""
         if device not in (0, self._values["comm.address"]):
             return
-        with_check = check is not None or bool(self._values["comm.checksum"])
-        if axis not in (0, 1):
+        with_check = (check is not None and not self._settings.checksums_when_set) or bool(
+            self._values["comm.checksum"]
+        )
+        if axis > self._settings.axes:
             verdict, data = "RJ", "BADAXIS"
         elif identifier not in ("", "--") and int(identifier) > 99:
             verdict, data, identifier = "RJ", "BADMESSAGEID", ""
@@ -253,6 +262,11 @@ class ZaberStage:
     # Commands
 
     def _execute(self, words: list[str], axis: int, t: float) -> tuple[str, str]:
+        if axis > 1:
+            return self._execute_elsewhere(words, self.others[axis - 2])
+        if axis == 0 and words[:1] == ["set"]:
+            for other in self.others:
+                self._execute_elsewhere(words, other)
         match words:
             case []:
                 return "OK", "0"
@@ -284,6 +298,20 @@ class ZaberStage:
                 self.reset(t)
                 return "OK", "0"
         return "RJ", "BADCOMMAND"
+
+    def _execute_elsewhere(self, words: list[str], values: dict[str, int]) -> tuple[str, str]:
+        """On an axis that drives nothing, which has settings all the same."""
+        match words:
+            case ["get", name] if name in values:
+                return "OK", str(values[name])
+            case ["set", name, text] if name in values and re.fullmatch(r"[+-]?\d+", text):
+                low, high = self._limits[name]
+                if low <= int(text) <= high:
+                    values[name] = int(text)
+                    return "OK", "0"
+            case [] | ["stop"] | ["warnings"]:
+                return "OK", "00" if words == ["warnings"] else "0"
+        return "RJ", "BADDATA" if words[:1] == ["set"] else "BADCOMMAND"
 
     def _home(self, t: float) -> tuple[str, str]:
         self._start(0.0, self._speed("limit.approach.maxspeed"), t, "home")

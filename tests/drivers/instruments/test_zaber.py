@@ -173,6 +173,7 @@ class FakeStage:
             "maxspeed": "153600",
             "accel": "205",
             "knob.enable": "1",
+            "comm.checksum": "0",
         }
         self.rejects: dict[str, str] = {}
         self.log: list[str] = []
@@ -225,8 +226,8 @@ class FakeStage:
                 return str(self.position)
             case ["get", key]:
                 return self.settings.get(key, "BADCOMMAND")
-            case ["set", "comm.checksum", "1"]:
-                self.checksums = True
+            case ["set", "comm.checksum", value]:
+                self.checksums, self.settings["comm.checksum"] = value == "1", value
             case ["set", key, value]:
                 self.settings[key] = value
             case ["warnings"]:
@@ -310,7 +311,8 @@ def test_set_up_reads_everything_and_moves_nothing(bench: Bench) -> None:
     assert stage.braking_distance(10e-3) == pytest.approx((10e-3) ** 2 / (2 * acceleration), rel=1e-9)
     assert stage.settings["resolution"] == "64" and stage.settings["microstep_um"] == "0.49609375"
     assert stage.settings["warnings_at_start"] == "WR"
-    assert stage.settings["knob"] == "locked" and bench.fake.settings["knob.enable"] == "0"
+    assert stage.settings["knob"] == "enabled" and bench.fake.settings["knob.enable"] == "1"
+    assert not any(command.startswith("set ") for command in bench.fake.log)
     assert not any(command.split()[0] in ("move", "home", "stop", "estop") for command in bench.fake.log if command)
 
 
@@ -319,7 +321,7 @@ def test_set_up_transcript() -> None:
     fake.flags = []
     bench = Bench(ZaberStage("stage", fake), fake)
     bench.run(0.1)
-    assert fake.log[:12] == [
+    assert fake.log[:13] == [
         "",
         "get deviceid",
         "get system.serial",
@@ -327,10 +329,11 @@ def test_set_up_transcript() -> None:
         "get resolution",
         "get limit.min",
         "get limit.max",
-        "get maxspeed",
         "get accel",
+        "get maxspeed",
+        "get knob.enable",
+        "get comm.checksum",
         "warnings",
-        "set knob.enable 0",
         "get pos",
     ]
 
@@ -371,15 +374,37 @@ def test_stage_without_reply_checksums_is_told_to_send_them(fake: FakeStage) -> 
     fake.checksums = False
     bench = Bench(ZaberStage("stage", fake), fake)
     bench.run(0.1)
+    assert bench.stage.settings["reply_checksums"] == "no" and fake.settings["comm.checksum"] == "0"
+    bench.stage.home()
+    bench.until_still()
     assert bench.stage.settings["reply_checksums"] == "yes"
+    again = [command for command in fake.log if command == "get resolution"]
+    assert len(again) == 2  # what was read without checksums is read again with them
+    bench.stage.give_back()
+    bench.run(0.1)
+    assert bench.stage.given_back and not fake.checksums
 
 
 def test_stage_that_cannot_send_checksums_still_works(fake: FakeStage) -> None:
     fake.checksums = False
     fake.rejects["set comm.checksum 1"] = "BADCOMMAND"
+    del fake.settings["comm.checksum"]
     bench = Bench(ZaberStage("stage", fake), fake)
     bench.run(0.1)
-    assert bench.stage.ready and bench.stage.settings["reply_checksums"] == "no"
+    bench.stage.home()
+    bench.until_still()
+    assert bench.stage.referenced and bench.stage.settings["reply_checksums"] == "no"
+
+
+def test_settings_read_wrongly_without_checksums_keep_the_stage_where_it_is(fake: FakeStage) -> None:
+    fake.checksums = False
+    bench = Bench(ZaberStage("stage", fake), fake)
+    bench.run(0.1)
+    fake.settings["limit.max"] = "315381"  # as a damaged digit looks
+    bench.stage.home()
+    with pytest.raises(DeviceRefused, match="without checksums"):
+        bench.run(0.2)
+    assert "home" not in fake.log
 
 
 def test_silent_stage(fake: FakeStage) -> None:
