@@ -328,9 +328,8 @@ class KeyenceLKG:
             self.counters["pushed"] += 1
         elif isinstance(message, Measured) and self._implausible(message):
             self.counters["implausible"] += 1
-            self._heard.hint = (
-                f"a Keyence value beyond limit_mm = {self._limit * self._unit * 1e3:g} (a display in um?)"
-            )
+            limit_mm = self._limit * self._unit * 1e3
+            self._heard.hint = f"a Keyence value beyond limit_mm = {limit_mm:g}: is its display in micrometres?"
         elif not self._dialogue.offer(message, now):
             self.counters["unexpected_replies"] += 1
 

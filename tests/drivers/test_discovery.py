@@ -276,7 +276,7 @@ class CanBus:
         out, self.out = self.out, []
         return out
 
-    def write(self, frame: CanFrame) -> None:
+    def write(self, frame: CanFrame, *, urgent: bool = False) -> None:
         self.sent.append(frame)
         if frame.id & 0x780 == 0x600:
             return self.sdo(frame.id & 0x7F, frame.data)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, label
+from drivers.heard import Heard
 from drivers.instruments.iseg_edcp import codec as edcp
 from drivers.instruments.iseg_edcp.codec import (
     ChannelControl,
@@ -75,6 +76,8 @@ class IsegEDCP:
         Fastest voltage ramp that the module accepts, in percent of its nominal voltage per second.
     status_bit_5 : str
         One of `STATUS_BIT_5`: what bit 5 of the module status means for this class of module.
+    boot_s : float
+        How long the first answer may take.
     """
 
     measures_current = True
@@ -90,6 +93,7 @@ class IsegEDCP:
         timeout_s: float = 0.25,
         max_ramp_percent_per_s: float = 20.0,
         status_bit_5: str = "unused",
+        boot_s: float = 0.0,
     ) -> None:
         where = label(name, link)
         if not 0 <= module <= 63:
@@ -121,12 +125,15 @@ class IsegEDCP:
         self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
         self._max_ramp = max_ramp_percent_per_s
         self._decoder = Decoder(module, self.counters)
+        self._boot_s = boot_s
+        self._heard = Heard()
         self._dialogue: Dialogue[Exchange, Message] = Dialogue(
             where,
             self._transmit,
             self.counters,
             timeout_s=timeout_s,
             advice=f"Check power, CAN cable and termination, bit rate, and that module {module} is its address.",
+            heard=self._heard,
         )
         self._exchange: Exchange | None = None
         self._collected: dict[int, Message] = {}
@@ -255,7 +262,7 @@ class IsegEDCP:
     def poll(self, now: float) -> Sequence[HVSample]:
         self._next_poll = now + LOST_AGAIN_S
         self._repeat_emergency_off(now)
-        self._inbox.extend(self._link.read())
+        self._inbox.extend(self._heard.frames(self._link.read()))
         while self._inbox:  # an error that an answer brings on leaves the others for the next poll
             message = self._decoder.feed(self._inbox.popleft())
             if isinstance(message, LogOn):
@@ -286,7 +293,7 @@ class IsegEDCP:
             often = self._emergencies < EMERGENCY_OFTEN
             self._next_emergency = now + (EMERGENCY_AGAIN_S if often else EMERGENCY_SELDOM_S)
             word = self._control & ~edcp.OWN_CONTROL | ChannelControl.EMERGENCY_OFF
-            self._link.write(write(self._module, edcp.CHANNEL_CONTROL, word, self._channel))
+            self._link.write(write(self._module, edcp.CHANNEL_CONTROL, word, self._channel), urgent=True)
 
     def _command(self, script: Script[None]) -> None:
         self._commands += 1
@@ -337,10 +344,16 @@ class IsegEDCP:
     # -- dialogue ---------------------------------------------------------------------------------------------------
 
     def _read(
-        self, item: Item, writes: tuple[CanFrame, ...] = (), *, once: bool = False, delay_s: float = 0.0
+        self,
+        item: Item,
+        writes: tuple[CanFrame, ...] = (),
+        *,
+        once: bool = False,
+        delay_s: float = 0.0,
+        boot_s: float = 0.0,
     ) -> Script[Answer[Message]]:
         channel = self._channel if item.per_channel else None
-        return (yield Ask(Exchange(item, channel, writes, once=once), delay_s=delay_s))
+        return (yield Ask(Exchange(item, channel, writes, once=once), delay_s=delay_s, boot_s=boot_s))
 
     def _integer(
         self, item: Item, writes: tuple[CanFrame, ...] = (), *, once: bool = False, delay_s: float = 0.0
@@ -375,7 +388,7 @@ class IsegEDCP:
 
     def _set_up(self) -> Script[None]:
         foreign = self.counters["foreign_requests"]
-        yield from self._integer(edcp.MODULE_STATUS)
+        yield from self._read(edcp.MODULE_STATUS, boot_s=self._boot_s)
         if self.counters["foreign_requests"] != foreign:
             raise DeviceRefused(
                 self._label,

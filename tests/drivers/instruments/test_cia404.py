@@ -200,7 +200,7 @@ class Node:
     def close(self) -> None:
         self.closed += 1
 
-    def write(self, f: CanFrame) -> None:
+    def write(self, f: CanFrame, *, urgent: bool = False) -> None:
         self.sent.append(f)
         if self.silent:
             return

@@ -191,7 +191,7 @@ class Module:
         assert isinstance(value, float | int)
         return value
 
-    def write(self, f: CanFrame) -> None:
+    def write(self, f: CanFrame, *, urgent: bool = False) -> None:
         self.sent.append(f)
         if self.silent:
             return
@@ -527,7 +527,7 @@ def test_an_emergency_off_goes_out_before_anything_is_read() -> None:
     order: list[str] = []
     read, write = rig.module.read, rig.module.write
     rig.module.read = lambda: order.append("read") or read()  # type: ignore[method-assign, func-returns-value]
-    rig.module.write = lambda f: order.append(f.data.hex()) or write(f)  # type: ignore[method-assign, func-returns-value]
+    rig.module.write = lambda f, urgent=False: order.append(f.data.hex()) or write(f)  # type: ignore[method-assign, func-returns-value, misc]
     rig.hv.emergency_off()
     rig.run(0.001)
     assert order[0] == "4001000020"
