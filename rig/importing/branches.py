@@ -35,8 +35,8 @@ def noise_of(values: Array) -> float:
 def legs_of(values: Array, turn: float = TURN) -> list[Leg]:
     """Parts between turning points; a way back of less than ``turn`` times the range is no turn.
 
-    >>> [(leg.start, leg.stop, leg.direction) for leg in legs_of(np.array([0.0, 1.0, 2.0, 1.0, 0.0, 2.0]))]
-    [(0, 3, 1), (3, 5, -1), (5, 6, 1)]
+    >>> [(leg.start, leg.stop, leg.direction) for leg in legs_of(np.array([0.0, 1.0, 2.0, 3.0, 2.0, 1.0, 0.0, 1.0]))]
+    [(0, 4, 1), (4, 7, -1), (7, 8, 1)]
     """
     if values.size < 2:
         return []

@@ -10,13 +10,16 @@ from dataclasses import dataclass
 from rig.importing.findings import Findings
 
 SEPARATORS = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " ": "blanks"}
+# Decimal commas, and columns parted by a comma with a blank behind it.
+COMMA_AND_BLANK = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?(?:, +[+-]?\d+,\d+(?:[eE][+-]?\d+)?)+\s*")
+SEPARATOR_NAMES = SEPARATORS | {", ": "comma and blank"}
 BY_NAME = {name: sign for sign, name in SEPARATORS.items()} | {sign: sign for sign in SEPARATORS}
 STAMP = r"(?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?"
 PREFIX = re.compile(rf"^\s*(?:{STAMP}\s*->\s?|\[{STAMP}\]\s*)")  # a serial monitor's time of receipt
 MANY = 0.8  # of the lines that begin with such a prefix
 TIME = re.compile(
     r"(?:(?:[0-9]{4}[-/.][0-9]{1,2}[-/.][0-9]{1,2}|[0-9]{1,2}[-/.][0-9]{1,2}[-/.][0-9]{2,4})[T ,]\s*)?"
-    r"(?:[0-9]{1,3}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+)?)\s*(?:[AaPp][Mm])?\s*(?:Z|[+-][0-9]{2}:?[0-9]{2})?"
+    r"(?:[0-9]{1,3}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+|:[0-9]{3})?)\s*(?:[AaPp][Mm])?\s*(?:Z|[+-][0-9]{2}:?[0-9]{2})?"
 )
 MISSING = frozenset(
     (
@@ -118,6 +121,8 @@ def judge(
     given = [line for line in sample if line.strip()]
     prefix = sum(bool(PREFIX.match(line)) for line in given) > MANY * len(given)
     quoted = any('"' in line for line in sample)
+    if separator is None and decimal in (None, ",") and _comma_and_blank(sample):
+        return Dialect(", ", ",", False, prefix)
     best: tuple[float, Dialect] | None = None
     for sign in [BY_NAME[separator]] if separator else SEPARATORS:
         for point in [decimal] if decimal else (".", ","):
@@ -134,6 +139,11 @@ def judge(
     if decimal is None:
         _ask_for_decimal(best[1], sample, findings)
     return best[1]
+
+
+def _comma_and_blank(sample: Sequence[str]) -> bool:
+    numbers = [line for line in sample if re.fullmatch(r"[\d\s,.;eE+-]*\d[\d\s,.;eE+-]*", line)]
+    return len(numbers) >= 3 and sum(bool(COMMA_AND_BLANK.fullmatch(line)) for line in numbers) > MANY * len(numbers)
 
 
 def _sample(lines: Sequence[str]) -> list[str]:

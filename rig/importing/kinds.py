@@ -25,8 +25,9 @@ NAMES: tuple[tuple[str, str], ...] = (
         "uniaxial",
         r"uni ?axial|einachsig|zug(versuch|prufung|test)?\b|zugversuch|tensile|simple tension|tension test|"
         r"tensile|traction|\but\b|\bst\b|dumbbell|dogbone|schulterstab|"
-        r"uniax|compression|druckversuch",
+        r"uniax|compression|druckversuch|trazione|traccion",
     ),
+    ("uniaxial", r"\btension\b"),
 )
 # Standards that describe a tensile test of a strip or dumb-bell.
 STANDARDS = re.compile(r"(astm )?d ?(412|638|882)\b|iso (37|527)\b|din (en iso )?(53504|527)\b|jis k ?6251")

@@ -46,7 +46,7 @@ def clock_values(cells: Sequence[str]) -> Array | None:
     counts on over midnight.
     """
     pattern = re.compile(
-        r"^(.*?)(\d{1,3}):(\d{2})(?::(\d{2}))?(?:[.,](\d+))?\s*([AaPp][Mm])?\s*(?:Z|[+-]\d{2}:?\d{2})?$"
+        r"^(.*?)(\d{1,3}):(\d{2})(?::(\d{2}))?(?:[.,](\d+)|:(\d{3}))?\s*([AaPp][Mm])?\s*(?:Z|[+-]\d{2}:?\d{2})?$"
     )
     seconds = np.empty(len(cells))
     dates: list[str] = []
@@ -54,7 +54,8 @@ def clock_values(cells: Sequence[str]) -> Array | None:
         found = pattern.match(cell)
         if found is None:
             return None
-        date, one, two, three, fraction, half = found.groups()
+        date, one, two, three, decimals, thousandths, half = found.groups()
+        fraction = decimals or thousandths  # data loggers part them by a colon
         if three is not None:
             value = 3600.0 * int(one) + 60.0 * int(two) + int(three)
         else:  # mm:ss.f, and hh:mm where there are no decimals

@@ -6,9 +6,10 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 
 from rig.importing.dialect import Dialect
-from rig.importing.headings import fold, split_unit
+from rig.importing.headings import fold, is_unit_row, split_unit
 from rig.importing.table import TextRow
 from rig.importing.units import Unit, unit_of
 
@@ -25,6 +26,9 @@ NAMES = (
     ),
 )
 NOT_A_DIMENSION = re.compile(r"final|after|at break|deformed|bruch|maximum|tolerance|unit|increment|change|rate|speed")
+OVER_SPECIMENS = (
+    r"mean|average|median|std|standard|deviation|coefficient|minimum|maximum|range|mittel|abweichung|moyenne"
+)
 
 
 @dataclass(frozen=True)
@@ -39,12 +43,48 @@ class Parameter:
 
 def parameters_in(rows: Sequence[TextRow], dialect: Dialect) -> dict[str, Parameter]:
     """Dimensions in rows of the form name, value, unit; the last of one name counts."""
-    found: dict[str, Parameter] = {}
+    found: dict[str, Parameter] = {one.name: one for one in _results(rows, dialect)}
     for row in rows:
         one = _parameter(row, dialect)
         if one is not None:
             found[one.name] = one
     return found
+
+
+def _results(rows: Sequence[TextRow], dialect: Dialect) -> list[Parameter]:
+    """Dimensions in a table of results: names in one row, units in it or in the next, a row for every specimen."""
+    found = []
+    for k, row in enumerate(rows):
+        names = [(j, _named(split_unit(cell)[0])) for j, cell in enumerate(row.cells)]
+        named = [(j, name) for j, name in names if name]
+        if len(named) < 2 or any(dialect.kind(cell) == "N" for cell in row.cells):
+            continue
+        below = [one for one in rows[k + 1 :] if one.given][:30]
+        units = below[0].cells if below and is_unit_row(below[0].given) else []
+        lines = list(takewhile(lambda one: _is_result(one, dialect), below[1:] if units else below))
+        for j, name in named:
+            unit = unit_of(units[j]) if j < len(units) else split_unit(row.cells[j])[2]
+            cells = [one.cells[j] for one in lines if j < len(one.cells)]
+            values = [dialect.value(cell) for cell in cells if dialect.kind(cell) == "N"]
+            if values and len(values) == len(lines) and unit is not None and min(values) > 0.0:
+                told = f"{row.cells[j]}, {', '.join(cells[:4])}, {unit.name}"
+                wanted = "area" if name == "area" else "length"
+                if unit.dimension == wanted:
+                    found.append(Parameter(name, tuple(value * unit.factor for value in values), lines[0].line, told))
+    return found
+
+
+def _is_result(row: TextRow, dialect: Dialect) -> bool:
+    """Whether a row holds numbers of one specimen, and not a mean or a deviation over them."""
+    numbers = sum(dialect.kind(cell) == "N" for cell in row.given)
+    return numbers >= 2 and numbers >= len(row.given) - 1 and not re.search(OVER_SPECIMENS, fold(row.given[0]))
+
+
+def _named(title: str) -> str:
+    """The dimension that a title names; "" where it names none, or not that of the undeformed specimen."""
+    folded = fold(title)
+    name = next((name for name, pattern in NAMES if re.search(pattern, folded)), "")
+    return "" if NOT_A_DIMENSION.search(folded) else name
 
 
 def _parameter(row: TextRow, dialect: Dialect) -> Parameter | None:
@@ -58,9 +98,8 @@ def _parameter(row: TextRow, dialect: Dialect) -> Parameter | None:
     if len(given) < 2 or not re.search(r"[A-Za-z]", given[0]):
         return None
     title, _, unit = split_unit(given[0].rstrip(" :="))
-    folded = fold(title)
-    name = next((name for name, pattern in NAMES if re.search(pattern, folded)), None)
-    if name is None or NOT_A_DIMENSION.search(folded):
+    name = _named(title)
+    if not name:
         return None
     values, unit = _values(given[1:], dialect, unit)
     wanted = "area" if name == "area" else "length"

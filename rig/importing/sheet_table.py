@@ -294,6 +294,8 @@ def _one_direction(chooser: Chooser, piece: Piece, source: Source, findings: Fin
 def _ask(axis: str, present: Sequence[str], chooser: Chooser, findings: Findings) -> None:
     """Say what is missing for the stretch ("x") or the stress ("y")."""
     table = chooser.table
+    if present:
+        chooser.choose(present[0])  # what else is wrong with the column is asked at once
     if axis == "x" and present:
         findings.obstacle(
             "length",

@@ -26,6 +26,10 @@ LABEL = re.compile(
     r"^\W*(specimen|sample|probe|prufling|eprouvette|echantillon|test|messung|versuch|run|essai|curve|kurve|"
     r"zyklus|cycle)\b.{0,60}$"
 )
+WITH_UNIT = re.compile(r"(?:^|[;,|\t]\s*)[+-]?\d+(?:[.,]\d+)?\s?(?:%|[a-zA-Zµ]{1,3}(?:/mm2|/mm²)?)(?=\s*(?:$|[;,|\t]))")
+NAMED = re.compile(r"(?:^|[\s;,|])[A-Za-z_][\w()/%]*\s?[:=]\s?[+-]?\d+(?:[.,]\d+)?(?=\s*(?:$|[\s;,|]))")
+REMARKS = ("comment", "comments", "kommentar", "commentaire", "remark", "remarks", "bemerkung")
+RULE = re.compile(r"[-=_:+~]{2,}")  # a line that is drawn
 UNIT_ROW_LABELS = ("unit", "units", "einheit", "einheiten", "unite", "unites", "y unit label", "uom", "dimension")
 
 
@@ -91,7 +95,7 @@ def find_table(text: TableText, findings: Findings, separator: str | None, decim
     if dialect is None or form is None:
         findings.obstacle(
             "table",
-            "no rows of at least two numbers were found",
+            "no rows of at least two numbers were found" + _what_cells_hold(text.lines),
             '--separator ";" and --decimal "," tell how the numbers are written',
         )
         return None
@@ -126,6 +130,15 @@ def find_table(text: TableText, findings: Findings, separator: str | None, decim
     return RawTable(
         text, dialect, headings, head.line, units[0] if units else None, head.labels, kept, preamble, left_out, numeric
     )
+
+
+def _what_cells_hold(lines: Sequence[str]) -> str:
+    """What stands beside the numbers of most lines, and keeps them from being a table."""
+    for pattern, what in ((NAMED, "names"), (WITH_UNIT, "units")):
+        found = [line for line in lines if pattern.search(line)]
+        if len(found) > 0.5 * len(lines):
+            return f"; cells hold their {what}, as in {shortened(found[-1])!r}: write them once, in the heading"
+    return ""
 
 
 def _columns(lines: Sequence[str], dialect: Dialect) -> tuple[int, list[bool]] | None:
@@ -169,10 +182,10 @@ def _sections(
         else:
             cells = dialect.cells(line)
             state = _state(dialect, cells, width, numeric)
-            if state == "wide":
+            if state == "wide" and len(current.rows) >= FEWEST_ROWS:
                 left_out.append(LeftOut(number, "more values than the table has columns", line))
                 continue
-            if state == "text":
+            if state in ("text", "wide"):  # a row of results above the table can be wider than it
                 if blanks and waiting:
                     waiting.append(TextRow(number - 1, []))
                 blanks = 0
@@ -290,7 +303,7 @@ def _heading(lead: list[TextRow], width: int, numeric: Sequence[bool], dialect: 
             remarks.append(row)
             continue
         given = row.given
-        if not given:
+        if not given or all(RULE.fullmatch(cell) for cell in given):
             continue
         cells = _glued(row.cells, width) if dialect.separator == " " else row.cells
         shifted = ["", *cells[1:]] if cells and fold(cells[0]) in UNIT_ROW_LABELS else cells
@@ -305,6 +318,9 @@ def _heading(lead: list[TextRow], width: int, numeric: Sequence[bool], dialect: 
         break
     for row in remarks:
         cells = _glued(row.cells, width)
+        if units is None and len(row.given) in (width, usable) and is_unit_row(row.given):
+            units = (row.line, _fitted(row.given, width))
+            continue
         if len(cells) == 1:
             cells = re.split(r"\s{2,}|\t|;|,", cells[0])
             cells = cells if len(cells) == width else row.cells[0].split()
@@ -355,6 +371,8 @@ def _check_heading(head: _Head, width: int, numeric: Sequence[bool], findings: F
     """R writes no name over the numbers of its rows; any other lack or surplus of names is asked about."""
     if not head.names:
         return
+    while len(head.names) > width and fold(head.names[-1]) in REMARKS:  # LabVIEW names a column that rows leave out
+        head.names.pop()
     named = [j for j, name in enumerate(head.names) if name]
     if len(head.names) > width:
         findings.obstacle(
@@ -380,7 +398,11 @@ def _check_heading(head: _Head, width: int, numeric: Sequence[bool], findings: F
 def _unit_row_above(preamble: Sequence[TextRow], width: int) -> tuple[int, list[str]] | None:
     """A row of units that says so in its first cell, as LabVIEW writes one; the first column is then time."""
     for row in reversed(preamble):
-        if row.cells and fold(row.cells[0]) in UNIT_ROW_LABELS and any(unit_of(cell) for cell in row.cells[1:]):
+        if (
+            row.cells
+            and fold(row.cells[0]) in UNIT_ROW_LABELS
+            and sum(unit_of(cell) is not None for cell in row.cells[1:]) >= min(2, width - 1)
+        ):
             first = "s" if fold(row.cells[0]) == "y unit label" else ""
             return row.line, _fitted([first, *row.cells[1:]], width)
     return None

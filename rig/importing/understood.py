@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rig.importing.columns import Chosen
-from rig.importing.dialect import SEPARATORS
+from rig.importing.dialect import SEPARATOR_NAMES
 from rig.importing.findings import Finding, shortened
 from rig.importing.table import LeftOut, RawTable
 
@@ -38,7 +38,7 @@ class Understood:
     def begin(self, table: RawTable) -> None:
         """Take over what the table itself says."""
         self.encoding = table.text.encoding
-        self.separator = SEPARATORS[table.dialect.separator]
+        self.separator = SEPARATOR_NAMES[table.dialect.separator]
         self.decimal = table.dialect.decimal
         self.heading_line = table.heading_line
         self.unit_line = table.unit_line

@@ -171,6 +171,13 @@ SPELLINGS = {
     "none": "1",
     "n/a": "1",
     "sec": "s",
+    "hh:mm:ss": "s",  # a column of times of day is in seconds once it is read
+    "h:m:s": "s",
+    "hh:mm:ss.sss": "s",
+    "hh:mm:ss.000": "s",
+    "hh:mm:ss,000": "s",
+    "mm:ss": "s",
+    "mm:ss.0": "s",
     "secs": "s",
     "second": "s",
     "seconds": "s",
