@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from calibration.breakdown.sample import Sample
+from rig.analysis.breakdown_logs import log_rows
 from rig.base.errors import ConfigError
 from rig.base.table import Table
 from rig.base.text import printable
@@ -69,8 +70,10 @@ class Breakdowns:
     names: list[str]
 
 
-def read_breakdowns(paths: Sequence[Path], reference_area_mm2: float | None = None) -> Breakdowns:
-    """Read tables and put them one below the other.
+def read_breakdowns(
+    paths: Sequence[Path], reference_area_mm2: float | None = None, of_logs: str = "field"
+) -> Breakdowns:
+    """Read tables and logs and put them one below the other; ``of_logs``: what of the logs, of `breakdown_logs.VALUES`.
 
     Raises
     ------
@@ -80,6 +83,10 @@ def read_breakdowns(paths: Sequence[Path], reference_area_mm2: float | None = No
     """
     rows: list[tuple[str, Row]] = []
     for path in paths:
+        if path.suffix.lower() == ".mcap":
+            found = validate({"specimen": log_rows(path, of_logs)}, Rows, KIND, str(path)).specimen
+            rows += [(f"{path}, {row.note}", row) for row in found]
+            continue
         text = read_text(path, KIND)
         toml = path.suffix.lower() == ".toml"
         raw = parse_toml(text, KIND, str(path)) if toml else {"specimen": _csv_rows(text, path)}

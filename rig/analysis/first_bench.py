@@ -245,18 +245,14 @@ def protocol_texts(reach: Extent, *, hv: bool) -> dict[str, str]:
     volts = f"voltages_V = [{', '.join(f'{level:g}' for level in levels)}]\n"
     precondition = f'[[step]]\ndo = "precondition"\ndisplacement_mm = {depth:g}\nspeed_mm_per_s = 4.0\ncycles = 2\n\n'
     sweep = f'[[step]]\ndo = "sweep"\ndisplacement_mm = {depth:g}\nspeed_mm_per_s = 1.0\n{volts}settle_s = 1.0\n\n'
-    ramp = f'[[step]]\ndo = "ramp"\ndisplacement_mm = {depth:g}\nspeed_mm_per_s = 4.0\n\n'
-    hold = '[[step]]\ndo = "hold"\nduration_s = 300.0\n\n'
+    relax = f'[[step]]\ndo = "relax"\ndisplacements_mm = [{depth:g}]\nspeed_mm_per_s = 4.0\nhold_s = 300.0\n\n'
     back = '[[step]]\ndo = "ramp"\ndisplacement_mm = 0.0\nspeed_mm_per_s = 1.0\n\n'
     made = {
         "sweep": ("Force against displacement at each voltage", start + precondition + sweep + end),
-        "relaxation": ("Relaxation after a fast ramp", start + ramp + hold + back + end),
+        "relaxation": ("Relaxation after a fast ramp", start + relax + back + end),
     }
     if top:
-        steps = "".join(
-            f'[[step]]\ndo = "voltage"\nvoltage_V = {rounded(top * part, down=True):g}\nsettle_s = 10.0\n\n'
-            for part in (0.25, 0.5, 0.75, 1.0)
-        )
-        made["breakdown"] = ("Voltage in steps, flat film: does it stand the limit?", start + steps + end)
+        rise = f'[[step]]\ndo = "breakdown"\nceiling_V = {top:g}\nrate_V_per_s = 50.0\nhold_s = 10.0\n\n'
+        made["breakdown"] = ("Voltage up to the limit, flat film: does it bear it?", start + rise + end)
     head = "#:schema ../schema/protocol.json\n# `dea-rig keys sweep` explains the keys of a step.\n"
     return {name: f'{head}title = "{title}"\n\n{body}' for name, (title, body) in made.items()}

@@ -25,6 +25,7 @@ class RigError(Exception):
     """
 
     exit_code = 1
+    breakdown = False  # whether it is the film's breakdown that shows
 
     def __init__(self, text: str = "", *, device: str = "", cause: str = "") -> None:
         super().__init__(text)
@@ -62,6 +63,18 @@ class FaultError(RigError):
 
 class StaleData(FaultError):
     """A sensor is silent, frozen or gives no values: the run ends, and the voltage is ramped down."""
+
+
+class Breakdown(FaultError):
+    """The film has broken down: it draws more current than charges it and may leak, or the supply reports an arc."""
+
+    breakdown = True
+
+
+class BreakdownCurrent(LimitError):
+    """The current is outside its limit, and charging the film does not explain it."""
+
+    breakdown = True
 
 
 class Stopped(RigError):

@@ -27,18 +27,31 @@ def command() -> None:
 @click.option("-o", "--out", type=FILE, help="All numbers as JSON, in SI units.")
 @click.option("--plot", type=FILE, help="Probability plot, SVG or PNG.")
 @click.option("--area-mm2", type=POSITIVE, help="Reference area. Absent: the mean.")
+@click.option(
+    "--value",
+    type=click.Choice(["field", "field-at-disk", "voltage"]),
+    default="field",
+    show_default=True,
+    help="What is taken from logs: the largest field in the film, that at the disk's edge, or the voltage.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the simulated campaigns.")
 @click.option(
     "--simulated", type=click.IntRange(200, 20000), default=1000, show_default=True, help="Campaigns simulated."
 )
 def breakdown(
-    files: tuple[Path, ...], out: Path | None, plot: Path | None, area_mm2: float | None, seed: int, simulated: int
+    files: tuple[Path, ...],
+    out: Path | None,
+    plot: Path | None,
+    area_mm2: float | None,
+    value: str,
+    seed: int,
+    simulated: int,
 ) -> None:
-    """Weibull statistics of breakdown from FILES, CSV or TOML, one row a specimen.
+    """Weibull statistics of breakdown from FILES: logs of breakdown steps, or CSV or TOML, one row a specimen.
 
     \b
     Columns: voltage_kV, voltage_V or field_V_per_um; censored (yes: survived up to this value);
-    if wanted area_mm2, group, specimen, note.
+    if wanted area_mm2, group, specimen, note. Logs need nothing more.
     """
     from calibration.breakdown.study import study
     from rig.analysis.breakdown_table import read_breakdowns
@@ -49,7 +62,7 @@ def breakdown(
     check_new(out, plot)
     if plot is not None and plot.suffix.lower() not in (".svg", ".png"):
         raise ConfigError(f"{plot}: a picture ends in .svg or .png.")
-    table = read_breakdowns(files, area_mm2)
+    table = read_breakdowns(files, area_mm2, value)
     found = study(table.sample, table.groups, seed, simulated)
     show(_fits(table, found))
     for line in _answers(found):
@@ -133,6 +146,10 @@ def _json(table: Breakdowns, found: Study, seed: int) -> str:
         "reference_area_m2": table.reference_area,
         "seed": seed,
         "level": 0.95,
+        "specimens": [
+            {"specimen": name, "value": float(at), "failed": bool(failed)}
+            for name, at, failed in zip(table.names, table.sample.value, table.sample.failed, strict=True)
+        ],
         **asdict(found),
     }
     return json.dumps(_finite(facts), indent=2, allow_nan=False) + "\n"

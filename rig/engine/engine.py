@@ -33,7 +33,7 @@ from rig.safety import heartbeat
 from rig.safety.arming import Arming
 from rig.safety.guard import SAFE_VOLTAGE, AnyGuard, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limit, Limits
-from rig.steps.base import Action, Turns, write_phase
+from rig.steps.base import Action, Result, Turns, write_phase
 from rig.steps.output import choose_about_live_output, confirm_voltage
 from rig.steps.rig import Rig
 
@@ -139,6 +139,7 @@ class Engine:
         """Carry out the plan and leave the rig safe. The error, if any, is what ended the run."""
         status, reason = "complete", "the protocol ended"
         error: Exception | None = None
+        found = False  # a result that ended the run: it is complete, and what is on goes off at once
         try:
             self.set_up()
             self._watch = Watch(self.bench, self.recorder, self.limits, self.guard)
@@ -146,6 +147,8 @@ class Engine:
             if self.rig.highest_voltage > 0 and not self._hands_come_first():
                 self._take_turns(confirm_voltage(self.rig))
             self._carry_out_all()
+        except Result as caught:
+            reason, found = str(caught), True
         except Stopped as caught:
             status, error = "stopped", caught
         except LimitError as caught:
@@ -160,10 +163,10 @@ class Engine:
             if self._doing:
                 error.add_note(f"It happened during {self._doing}.")
         ended = self.clock.now()
-        snapshot = status in ("limit", "fault") and self.guard is not None and self.guard.commanded
+        snapshot = (found or status in ("limit", "fault")) and self.guard is not None and self.guard.commanded
         rest = Teardown(self.bench, self.guard, self.recorder, self.control).run(
             reason,
-            error is None or _lets_ramp_down(error),
+            not found and (error is None or _lets_ramp_down(error)),
             self._next_turn,
             ended + SNAPSHOT_S - ROUNDING_S if snapshot else ended,
         )
@@ -321,11 +324,29 @@ class Engine:
         with closing(action.carry_out(self.rig)) as turns:
             for _ in turns:
                 self._show_now_and_then(done + min(self.clock.now() - began, action.duration), total, label)
-                self._turn()
+                try:
+                    self._turn()
+                except (LimitError, FaultError) as error:
+                    if action.hears_errors:
+                        self._tell(turns, error)
+                    raise
                 self._keep_hands_safe(action)
                 if self.control.pausing:
                     return False
         return True
+
+    def _tell(self, turns: Turns, error: LimitError | FaultError) -> None:
+        """Let the action know what ends it. A breakdown may be its result; whatever else it does, the error stands."""
+        if self.guard is not None and not _lets_ramp_down(error):
+            with suppress(Exception):  # the teardown does it again
+                self.guard.kill(str(error))  # first: what an action does now takes its time
+        try:
+            turns.throw(error)
+        except Result:
+            if error.breakdown:
+                raise
+        except Exception:
+            return
 
     def _keep_hands_safe(self, action: Action) -> None:
         """A step whose hands come near the rig asks for them only when the output is latched and measured off."""

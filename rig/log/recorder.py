@@ -185,6 +185,22 @@ class Recorder:
             unit=unit,
         )
 
+    def result(
+        self, step: int, kind: str, outcome: str, name: str, value: float, standard_uncertainty: float, unit: str
+    ) -> None:
+        """Write what a step has found, in SI units; NaN for an uncertainty that is not known."""
+        self._write(
+            "/result",
+            self._clock.now(),
+            step=step,
+            kind=kind,
+            outcome=outcome,
+            name=name,
+            value=value,
+            standard_uncertainty=standard_uncertainty,
+            unit=unit,
+        )
+
     def units(self, force: str) -> None:
         """Write the unit of the force sensor's readings, which have none in their name, and all gains."""
         self._metadata("units", {"/force/sample reading": force})

@@ -132,6 +132,19 @@ CHANNELS: dict[str, Channel] = {
             Field("unit", "string", "unit of value and uncertainty"),
         ),
     ),
+    "/result": Channel(
+        "Result",
+        (
+            _T,
+            Field("step", "uint32", "index of the protocol step that found it"),
+            Field("kind", "string", "kind of that step: breakdown, ..."),
+            Field("outcome", "string", "how it ended; of breakdown: breakdown, ceiling or limit"),
+            Field("name", "string", "voltage, field, field_at_disk, displacement, duration, charge, ..."),
+            Field("value", "double", "the value, in `unit`"),
+            Field("standard_uncertainty", "double", "its standard uncertainty, in `unit`; NaN where it is not known"),
+            Field("unit", "string", "unit of value and uncertainty"),
+        ),
+    ),
     "/command": Channel(
         "Command",
         (

@@ -15,7 +15,7 @@ from enum import Enum, Flag
 from typing import TYPE_CHECKING, TypeAlias
 
 from drivers.roles import HVFlag, HVSample, HVSupply, Renewed
-from rig.base.errors import FaultError, LimitError, StaleData
+from rig.base.errors import Breakdown, BreakdownCurrent, FaultError, LimitError, StaleData
 from rig.safety.commanded import DEVIATION_PART, DEVIATION_V, CommandedRamp
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limit, Limits
@@ -39,6 +39,7 @@ CHARGING_PART = 0.2  # what the model may be wrong in the film's charging curren
 SAFE_SAMPLES = 2  # consecutive samples that show the output off before we call it safe
 
 DRIVEN = HVFlag.ON | HVFlag.RAMPING  # an output that is driven may be low only for now
+ARC = HVFlag.ARC | HVFlag.TRIPPED  # what the supply itself sees of a breakdown
 TRIP = HVFlag.TRIPPED | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.INTERLOCK_OPEN | HVFlag.ARC | HVFlag.FAULT
 
 
@@ -354,11 +355,11 @@ class Guard:
             return
         self._limits.measured_voltage.check(sample.voltage, "HV monitor")
         if self._supply.measures_current:
-            self._limits.current.check(sample.current, "HV monitor")
             self._judge_current(sample)
         faults = sample.flags & TRIP
         if faults:
-            raise FaultError(f"hv: the supply reports {flag_names(faults)}.")
+            kind = Breakdown if faults & ARC else FaultError
+            raise kind(f"hv: the supply reports {flag_names(faults)}.")
         self._judge_deviation(sample, before)
 
     def _judge_frozen(self, sample: HVSample) -> None:
@@ -386,7 +387,7 @@ class Guard:
             )
 
     def _judge_current(self, sample: HVSample) -> None:
-        r"""More current than charges the film and may leak, in two samples running, is a breakdown.
+        r"""More current than charges the film and may leak, in two samples running or above the limit, is a breakdown.
 
         A film takes :math:`i = d(CV)/dt + V/R`: here the model's charge on the deformed film, differenced from sample
         to sample, and the limit ``leakage_uA``. While it discharges the supply may show no current at all.
@@ -395,13 +396,20 @@ class Guard:
         volts = max(sample.voltage, 0.0)
         charge = volts * self._film.capacitance(h if math.isfinite(h) else 0.0, volts)
         last, self._charge = self._charge, (sample.t, charge)
-        if last is None or not sample.t > last[0]:
-            return
-        charging = max((charge - last[1]) / (sample.t - last[0]), 0.0)
+        known = last is not None and sample.t > last[0]
+        charging = max((charge - last[1]) / (sample.t - last[0]), 0.0) if last is not None and known else math.nan
         allowed = charging * (1 + CHARGING_PART) + self._limits.leakage
+        try:
+            self._limits.current.check(sample.current, "HV monitor")
+        except LimitError as error:
+            if sample.current > allowed:
+                raise BreakdownCurrent(str(error)) from None
+            raise
+        if not known:
+            return
         self._leaking_samples = 0 if sample.current <= allowed else self._leaking_samples + 1
         if self._leaking_samples >= DEVIATION_SAMPLES:
-            raise FaultError(
+            raise Breakdown(
                 f"hv: breakdown, the film draws {sample.current * 1e6:.3g} uA where charging and leakage explain at "
                 f"most {allowed * 1e6:.3g} uA."
             )

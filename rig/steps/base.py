@@ -31,6 +31,13 @@ NotNegative = Annotated[float, Field(ge=0)]
 ALLOWED_PART, ALLOWED_S = 1.5, 10.0
 
 
+class Result(Exception):
+    """The experiment has its result, which ends the run well: the output goes off at once, nothing more is done.
+
+    Raised by an action in place of the error that the result shows itself by, such as a breakdown that was wanted.
+    """
+
+
 class OnResume(Enum):
     """What becomes of a step that was done already, when a run that ended early goes on at a later one."""
 
@@ -150,6 +157,7 @@ class Action(ABC):
     record: bool = False
     kind: str = ""
 
+    hears_errors: ClassVar[bool] = False  # whether a limit or fault is thrown into it: it may have its `Result` by that
     begins_anywhere: ClassVar[bool] = False  # whether it needs no way back to where it begins after a pause
 
     def __post_init__(self) -> None:

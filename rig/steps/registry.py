@@ -19,6 +19,7 @@ from typing import get_args
 from rig.base.errors import ConfigError
 from rig.steps.approach import Approach
 from rig.steps.base import Step
+from rig.steps.breakdown import Breakdown
 from rig.steps.follow import Follow
 from rig.steps.glide import Glide
 from rig.steps.hold import Hold
@@ -30,6 +31,7 @@ from rig.steps.precondition import Precondition
 from rig.steps.press import Press
 from rig.steps.prompt import Prompt
 from rig.steps.ramp import Ramp
+from rig.steps.relax import Relax
 from rig.steps.return_ import Return
 from rig.steps.sweep import Sweep
 from rig.steps.visit import Visit
@@ -57,6 +59,8 @@ OWN: Mapping[str, type[Step]] = {
         Prompt,
         Voltage,
         Sweep,
+        Relax,
+        Breakdown,
         Return,
         Follow,
         Mount,

@@ -48,6 +48,8 @@ LEAST: dict[str, tuple[str, dict[str, Any]]] = {
     "prompt": ("nothing", {"text": "Close the lid."}),
     "voltage": ("contact", {"voltage_V": 500.0}),
     "sweep": ("contact", {"displacement_mm": 4.0, "speed_mm_per_s": 1.0, "voltages_V": [0.0, 500.0]}),
+    "relax": ("contact", {"displacements_mm": [2.0, 4.0], "speed_mm_per_s": 5.0, "hold_s": 30.0, "voltage_V": 500.0}),
+    "breakdown": ("contact", {"ceiling_V": 1500.0}),
     "return": ("raised", {}),
     "follow": ("contact", {"bias": SPRING, "voltages_V": [500.0]}),
     "mount": ("nothing", {"fixture": "none"}),
@@ -68,6 +70,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "prompt": {},
     "voltage": {"settle_s": 1.0},
     "sweep": {"from_mm": 0.0, "voltages_V": [0.0], "cycles": 1, "settle_s": 1.0},
+    "relax": {"voltage_V": 0.0, "voltage_after": 0.5},
+    "breakdown": {"rate_V_per_s": None, "hold_s": 0.0},
     "return": {"speed_mm_per_s": 2.0, "clearance_mm": 2.0},
     "follow": {"rate_Hz": 40.0, "speed_mm_per_s": 1.0, "settle_s": 1.0, "average_s": 5.0, "patience_s": 60.0},
     "mount": {},
@@ -134,6 +138,18 @@ MOVES: dict[str, dict[str, tuple[Any, set[str]]]] = {
         "voltages_V": ([0.0, 600.0], {"label", "voltage", "duration"}),
         "cycles": (2, {"number"}),
         "settle_s": (2.0, {"duration", "settle"}),
+    },
+    "relax": {
+        "displacements_mm": ([2.0, 3.0], {"label", "h", "duration"}),
+        "speed_mm_per_s": (4.0, {"duration", "speed"}),
+        "hold_s": (40.0, {"duration"}),
+        "voltage_V": (600.0, {"label", "voltage", "duration"}),
+        "voltage_after": (0.4, {"duration"}),
+    },
+    "breakdown": {
+        "ceiling_V": (1600.0, {"label", "voltage", "duration"}),
+        "rate_V_per_s": (100.0, {"label", "duration", "rate"}),
+        "hold_s": (5.0, {"duration", "hold"}),
     },
     "return": {
         "speed_mm_per_s": (1.0, {"duration", "speed"}),
@@ -227,6 +243,14 @@ BOUNDS: dict[str, dict[str, tuple[list[Any], list[Any]]]] = {
         "cycles": CYCLES,
         "settle_s": NOT_NEGATIVE,
     },
+    "relax": {
+        "displacements_mm": ([[0.0], [float(n) for n in range(50)]], [[], [1.0, 1.0], [float(n) for n in range(51)]]),
+        "speed_mm_per_s": POSITIVE,
+        "hold_s": POSITIVE,
+        "voltage_V": NOT_NEGATIVE,
+        "voltage_after": ([TINY, 1.0 - TINY], [0.0, 1.0]),
+    },
+    "breakdown": {"ceiling_V": POSITIVE, "rate_V_per_s": POSITIVE, "hold_s": NOT_NEGATIVE},
     "return": {"speed_mm_per_s": POSITIVE, "clearance_mm": NOT_NEGATIVE},
     "follow": {
         "bias": ([SPRING, {"kind": "mass", "weight_N": TINY}], [{"kind": "lever"}, {"kind": "mass", "weight_N": 0.0}]),
@@ -379,7 +403,7 @@ def test_the_facts_of_a_step_are_those_of_its_actions(do: str, scene: Any) -> No
     assert max(level for one in actions for level in one.voltage) <= max(actions[0].by.highest_voltage, 100.0)
     asks = {"prompt", "mount", "weigh", "jog"}  # whoever is asked to do something there touches the rig
     assert step.hands is (do in asks)
-    assert step.needs_contact is (do in {"precondition", "ramp", "voltage", "sweep", "follow"})
+    assert step.needs_contact is (do in {"precondition", "ramp", "voltage", "sweep", "relax", "breakdown", "follow"})
     assert step.finds_contact is (do == "approach")
 
 

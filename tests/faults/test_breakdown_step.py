@@ -1,0 +1,94 @@
+"""A breakdown that is wanted is a result: complete, off at once and proven, the values those of the simulated film."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from rig.base.errors import LimitError
+from rig.log.reader import read_log
+from rig.sim.truth import Fault
+
+Tell = Callable[..., Any]  # of conftest.Story
+HEAD = """
+[[step]]
+do = "home"
+[[step]]
+do = "zero"
+duration_s = 0.5
+[[step]]
+do = "approach"
+speed_mm_per_s = 4.0
+threshold_mN = 8.0
+max_travel_mm = 8.0
+[[step]]
+do = "ramp"
+displacement_mm = 3.0
+speed_mm_per_s = 4.0
+"""
+TEST = HEAD + '[[step]]\ndo = "breakdown"\nceiling_V = 1700\n'
+AFTER = '[[step]]\ndo = "ramp"\ndisplacement_mm = 2.0\nspeed_mm_per_s = 4.0\n'
+WEAK = ("[simulation.film]", "[simulation.film]\nbreakdown_field_MV_per_m = 40.0")
+
+
+def results(story: Any) -> dict[str, dict[str, Any]]:
+    return {m.fields["name"]: m.fields for m in read_log(story.log).messages("/result")}
+
+
+@pytest.mark.parametrize("rate", [None, 100.0])
+def test_a_breakdown_is_the_result_and_the_output_is_off_at_once(tell: Tell, rate: float | None) -> None:
+    text = TEST + (f"rate_V_per_s = {rate}\n" if rate else "") + AFTER
+    story = tell(replace=WEAK, protocol=text)
+    assert story.error is None and story.outcome.status == "complete" and story.outcome.safe, story.outcome
+    assert story.final_output == 0.0 and "emergency_off" in story.control_words
+    truth = story.bench.world.film.breakdown_voltage(3e-3)
+    found = results(story)
+    assert {one["outcome"] for one in found.values()} == {"breakdown"}
+    voltage = found["voltage"]
+    allowed = 3.0 * voltage["standard_uncertainty"] + 0.01 * truth
+    assert abs(voltage["value"] - truth) < allowed < 0.2 * truth
+    assert found["field_at_disk"]["value"] == pytest.approx(40e6, rel=0.08)
+    assert found["displacement"]["value"] == pytest.approx(3e-3, abs=0.1e-3)
+    # Nothing after it is done, and the time around it is marked.
+    assert "2 mm" not in "".join(m.fields["label"] for m in read_log(story.log).messages("/phase"))
+    assert "snapshot" in read_log(story.log).metadata
+    after = [t for t, volts in story.outputs if volts > 60.0]
+    assert not after or max(after) < story.end - 0.5
+
+
+def test_a_film_that_bears_the_ceiling_is_censored_there_and_the_run_goes_on(tell: Tell) -> None:
+    story = tell(protocol=TEST.replace("1700", "900") + "hold_s = 1.0\n" + AFTER)
+    assert story.error is None and story.outcome.status == "complete" and story.outcome.safe
+    found = results(story)
+    assert {one["outcome"] for one in found.values()} == {"ceiling"}
+    assert found["voltage"]["value"] == pytest.approx(900.0, abs=10.0)
+    assert "2 mm" in "".join(m.fields["label"] for m in read_log(story.log).messages("/phase"))
+
+
+def test_a_limit_that_is_met_first_is_a_limit_and_says_so(tell: Tell) -> None:
+    story = tell(protocol=TEST, replace=("field_V_per_um = 80.0", "field_V_per_um = 30.0"), checked=False)
+    assert isinstance(story.error, LimitError) and story.outcome.status == "limit" and story.outcome.safe
+    assert story.final_output == 0.0
+
+
+def test_a_fault_is_no_result(tell: Tell) -> None:
+    def fail(now: float, bench: Any, control: Any) -> None:
+        if bench.world.output.at(now)[0] > 500.0:
+            bench.inject(Fault.model_validate({"role": "force", "kind": "silent"}))
+
+    story = tell(protocol=TEST, meanwhile=fail)
+    assert story.outcome.status == "fault" and not results(story) and story.final_output < 60.0
+
+
+def test_a_breakdown_elsewhere_is_still_a_fault(tell: Tell) -> None:
+    story = tell(replace=WEAK, protocol=HEAD + '[[step]]\ndo = "voltage"\nvoltage_V = 1700\n')
+    assert story.outcome.status == "fault" and not results(story)
+
+
+@pytest.mark.parametrize("more", ["rate_V_per_s = 1000.0\n", ""])
+def test_a_rate_above_the_supplys_and_a_ceiling_below_what_is_on_are_refused(tell: Tell, more: str) -> None:
+    before = '[[step]]\ndo = "voltage"\nvoltage_V = 1700\n' if not more else ""
+    with pytest.raises(LimitError, match="rate_V_per_s" if more else "ceiling_V"):
+        tell(protocol=TEST.replace('[[step]]\ndo = "breakdown"', before + '[[step]]\ndo = "breakdown"') + more)
