@@ -32,6 +32,7 @@ SUPPLY_V = 5000.0
 DEPTH = 0.45  # of the gap between disk and ring
 FIELD_PART = 0.6  # of the film's strength
 CONTACT_MM, APPROACH_MM = 40.0, 36.0
+Instruments = dict[str, dict[str, Value]]  # the keys of each instrument's table, "driver" among them, by role
 DRIVERS = {"stage": "zaber", "force": "gsv8", "displacement": "keyence-lkg", "hv": "iseg-edcp"}
 ONE_YEAR = (date(2019, 1, 1), date(2099, 12, 31))  # a data sheet does not expire; a calibration does
 
@@ -132,9 +133,15 @@ def rounded(value: float, *, down: bool = False) -> float:
     return float(f"{(math.floor if down else round)(value / step) * step:.6g}")
 
 
-def scene_text(film: Film, reach: Extent, *, hv: bool, displacement: bool) -> str:
-    """The scene, every key explained."""
-    volts = hv and reach.voltage_V > 0
+def simulated_instruments(*, hv: bool, displacement: bool) -> Instruments:
+    """The instruments of the simulated bench, by role."""
+    roles = [role for role in DRIVERS if (role != "displacement" or displacement) and (role != "hv" or hv)]
+    return {role: {"driver": DRIVERS[role]} for role in roles}
+
+
+def scene_text(film: Film, reach: Extent, instruments: Instruments, *, real: bool = False) -> str:
+    """The scene, every key explained; ``real``: its instruments have ports."""
+    volts = "hv" in instruments and reach.voltage_V > 0
     limits: dict[str, Value] = {
         "force_N": 0.9 * reach.cell_N,
         "displacement_mm": rounded(1.2 * reach.displacement_mm),
@@ -146,7 +153,8 @@ def scene_text(film: Film, reach: Extent, *, hv: bool, displacement: bool) -> st
     law = law_table(MaterialTable, find_law(film.preset.law), optional=False)
     parts = [
         "#:schema schema/scene.json",
-        f"# {film.preset.title}, on the simulated bench. `dea-rig devices` tells the ports of a real one.",
+        f"# {film.preset.title}, "
+        + ("on the instruments found." if real else "simulated. `dea-rig devices` tells the ports of a real bench."),
         "",
         commented("", Scene, {"title": f"{film.preset.title}, disk {film.disk_radius_mm:g} mm"}),
         commented("[session]", SessionTable, {}),
@@ -155,15 +163,19 @@ def scene_text(film: Film, reach: Extent, *, hv: bool, displacement: bool) -> st
         commented("[limits]", LimitsTable, limits),
     ]
     given: dict[str, dict[str, Value]] = {
-        "stage": {"approach_from_mm": APPROACH_MM},
+        "stage": {} if real else {"approach_from_mm": APPROACH_MM},  # where a real film is, nobody knows yet
         "force": {"rate_Hz": 100.0, "certificate": "certificates/force.toml"},
         "displacement": {"certificate": "certificates/displacement.toml"},
         "hv": {"ramp_V_per_s": 300.0, "certificate": "certificates/hv.toml"},
     }
-    roles = [role for role in given if (role != "displacement" or displacement) and (role != "hv" or volts)]
-    for role in roles:
-        settings = instrument(role, DRIVERS[role]).settings
-        parts.append(commented(f"[{role}]", settings, {"driver": DRIVERS[role], **given[role]}))
+    for role, keys in instruments.items():
+        if role == "hv" and not volts:
+            continue
+        settings = instrument(role, str(keys["driver"])).settings
+        usual = {key: value for key, value in given[role].items() if key in settings.model_fields}
+        parts.append(commented(f"[{role}]", settings, {**keys, **usual}))
+    if real:
+        return "\n".join(parts)
     truth = of_role("force")[DRIVERS["force"]].truth
     parts += [
         "# The simulated bench; a real one has ports instead. Remove these tables then.",
@@ -173,15 +185,17 @@ def scene_text(film: Film, reach: Extent, *, hv: bool, displacement: bool) -> st
     return "\n".join(parts)
 
 
-def certificate_texts(reach: Extent, *, hv: bool, displacement: bool) -> dict[str, str]:
+def certificate_texts(reach: Extent, instruments: Instruments, *, real: bool = False) -> dict[str, str]:
     """Certificates with values of data sheets, by role, until `dea-rig calibrate` makes better ones."""
 
     def common(role: str, what: str) -> dict[str, Value]:
-        serial = getattr(of_role(role)[DRIVERS[role]].truth(), "serial_number", "")  # type: ignore[call-arg]
+        serial = instruments[role].get("serial", "")
+        if not real:
+            serial = getattr(of_role(role)[DRIVERS[role]].truth(), "serial_number", "")  # type: ignore[call-arg]
         return {
             "format": "dea-rig certificate 1",
             "role": role,
-            "instrument": f"{DRIVERS[role]}, values of the data sheet",
+            "instrument": f"{instruments[role]['driver']}, values of the data sheet",
             "serial": str(serial),
             "valid_from": ONE_YEAR[0],
             "valid_until": ONE_YEAR[1],
@@ -191,20 +205,21 @@ def certificate_texts(reach: Extent, *, hv: bool, displacement: bool) -> dict[st
 
     head = "#:schema ../schema/certificate.json\n# Values of a data sheet; make real ones: dea-rig calibrate.\n\n"
     cell = reach.cell_N
+    in_newtons = instruments["force"]["driver"] != DRIVERS["force"]  # the others state newtons themselves
     found = {
         "force": commented(
             "",
             ForceFile,
             {
                 **common("force", f"{cell:g} N at 2 mV/V"),
-                "gain_N_per_mV_per_V": cell / 2.0,
+                **({"gain_N_per_N": 1.0} if in_newtons else {"gain_N_per_mV_per_V": cell / 2.0}),
                 "noise_N": 0.005 * cell,
                 "zero_uncertainty_N": 0.0005 * cell,
                 "range_N": [-cell, cell],
             },
         )
     }
-    if displacement:
+    if "displacement" in instruments:
         found["displacement"] = commented(
             "",
             DisplacementFile,
@@ -216,7 +231,7 @@ def certificate_texts(reach: Extent, *, hv: bool, displacement: bool) -> dict[st
                 "range_m": [-0.08, 0.08],
             },
         )
-    if hv and reach.voltage_V > 0:
+    if "hv" in instruments and reach.voltage_V > 0:
         found["hv"] = commented(
             "",
             HVFile,

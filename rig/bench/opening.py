@@ -50,7 +50,6 @@ def open_ports(scene: Scene, clock: RealClock) -> Opened:
 
 def open_memory(scene: Scene, wired: Wired, clock: VirtualClock | None = None) -> Opened:
     """The links to a bench in memory, in virtual time; by default a clock that only moves the bench along."""
-    wired.prepare()
     opened = Opened(clock or VirtualClock(wired.advance), {}, wired if isinstance(wired, SimulatedBench) else None)
     for role in scene.instruments:
         wire = wired.wire(role)

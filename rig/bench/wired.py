@@ -10,10 +10,6 @@ from rig.sim.wire import ByteWire, FrameWire
 class Wired(Protocol):
     """A bench in memory, simulated or replayed, as seen from the host's ends of its wires."""
 
-    def prepare(self) -> None:
-        """Do now what takes long."""
-        ...
-
     def wire(self, role: str) -> ByteWire | FrameWire: ...
 
     def advance(self, t: float) -> None:

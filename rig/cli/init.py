@@ -11,7 +11,7 @@ import click
 from rig.cli.files import FOLDER, POSITIVE, Number
 
 if TYPE_CHECKING:
-    from rig.analysis.first_bench import Film
+    from rig.analysis.first_bench import Film, Instruments
 
 
 @click.command("init")
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 @click.option("--name", default="film-1", show_default=True, help="Of this specimen.")
 @click.option("--no-hv", is_flag=True, help="A bench without high voltage.")
 @click.option("--no-laser", is_flag=True, help="A bench without a displacement sensor.")
+@click.option("--from-devices", is_flag=True, help="A real bench: find the instruments, write ports and serials.")
+@click.option("--port", "ports", multiple=True, help="With --from-devices: look on this serial port only.")
+@click.option("--bus", "buses", multiple=True, metavar="INTERFACE:CHANNEL[@BITRATE]", help="And on this CAN bus.")
 @click.option("--yes", is_flag=True, help="Ask nothing: usual values for what is not given.")
 def command(
     folder: Path,
@@ -35,14 +38,17 @@ def command(
     name: str,
     no_hv: bool,
     no_laser: bool,
+    from_devices: bool,
+    ports: tuple[str, ...],
+    buses: tuple[str, ...],
     yes: bool,
 ) -> None:
     """Write scene.toml, protocols/ and certificates/ into a new FOLDER, every key explained.
 
-    The scene runs on the simulated bench; give its instruments ports, and it runs on yours. What is not given as an
-    option is asked.
+    The scene runs on the simulated bench; with --from-devices on the instruments that answer (nothing is sent to them
+    but questions). What is not given as an option is asked.
     """
-    from rig.analysis.first_bench import Film
+    from rig.analysis.first_bench import Film, simulated_instruments
     from rig.base.errors import ConfigError
     from rig.scene.presets import PRESETS
 
@@ -72,12 +78,24 @@ def command(
         prestretch=asked("Pre-stretch, 1 is none", prestretch, known.prestretch),
     )
     _check(film)
-    made = _write(film, folder, hv=not no_hv, displacement=not no_laser)
+    instruments = simulated_instruments(hv=not no_hv, displacement=not no_laser)
+    if from_devices:
+        instruments = _found(
+            ports, buses, [role for role in ("stage", "force", "displacement", "hv") if role in instruments]
+        )
+    made = _write(film, folder, instruments, real=from_devices)
     for path in made:
         click.echo(f"written: {path}")
     scene, sweep, log = folder / "scene.toml", folder / "protocols" / "sweep.toml", folder / "run.mcap"
     click.echo(f"Film: {known.source}.")
+    if from_devices:
+        click.echo(
+            "The certificates are guesses from data sheets: write what yours say, or calibrate before you measure."
+        )
     click.echo("Next:")
+    if from_devices:
+        click.echo(f"  dea-rig read {scene}")
+        click.echo(f"  dea-rig jog {scene}    # find where the film is, then set stage.approach_from_mm short of it")
     click.echo(f"  dea-rig check {scene} {sweep}")
     click.echo(f"  dea-rig run {scene} {sweep} -o {log}")
     click.echo(f"  dea-rig fit {log} -o {folder / 'fit.json'} --report {folder / 'report.html'}")
@@ -103,7 +121,37 @@ def _check(film: Film) -> None:
         )
 
 
-def _write(film: Film, folder: Path, *, hv: bool, displacement: bool) -> list[Path]:
+def _found(ports: tuple[str, ...], buses: tuple[str, ...], roles: list[str]) -> Instruments:
+    """The keys of the instruments that answer, for these roles."""
+    import tomllib
+
+    from drivers.discovery import Bus, discover
+    from rig.base.clock import RealClock
+    from rig.base.errors import ConfigError
+
+    try:
+        named = [Bus.parse(text) for text in buses]
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.", param_hint="--bus") from None
+    everywhere = not (ports or buses)
+    answered = discover(RealClock(), None if everywhere else ports, None if everywhere else named)
+    found: Instruments = {}
+    for role in roles:
+        ours = [one for one in answered if one.role == role]
+        if len(ours) > 1:
+            places = ", ".join(one.where for one in ours)
+            raise ConfigError(f"{role}: several instruments answer: {places}. Name the ports and buses: --port, --bus.")
+        if ours:
+            found[role] = tomllib.loads(ours[0].scene)[role]
+    if missing := [role for role in ("stage", "force") if role not in found]:
+        raise ConfigError(
+            f"No instrument answers as {' and '.join(missing)}; nothing was written. `dea-rig devices` shows who "
+            "answers where, and why others do not. A CAN bus is named so: --bus slcan:/dev/ttyACM0@125000."
+        )
+    return found
+
+
+def _write(film: Film, folder: Path, instruments: Instruments, *, real: bool) -> list[Path]:
     """All files at once: the folder appears when every protocol has passed `check` on the scene, or not at all."""
     import shutil
     from importlib.resources import as_file, files
@@ -114,10 +162,10 @@ def _write(film: Film, folder: Path, *, hv: bool, displacement: bool) -> list[Pa
     from rig.protocol.experiment import prepare
 
     reach = extent(film)
-    texts = {"scene.toml": scene_text(film, reach, hv=hv, displacement=displacement)}
-    for role, text in certificate_texts(reach, hv=hv, displacement=displacement).items():
+    texts = {"scene.toml": scene_text(film, reach, instruments, real=real)}
+    for role, text in certificate_texts(reach, instruments, real=real).items():
         texts[f"certificates/{role}.toml"] = text
-    protocols = protocol_texts(reach, hv=hv)
+    protocols = protocol_texts(reach, hv="hv" in instruments)
     texts |= {f"protocols/{name}.toml": text for name, text in protocols.items()}
     try:
         with TemporaryDirectory(prefix=".dea-rig-init-", dir=folder.absolute().parent) as parent:

@@ -152,9 +152,6 @@ class _Desk:
             for role, table in scene.instruments.items()
         }
 
-    def prepare(self) -> None:
-        """Nothing takes long."""
-
     def wire(self, role: str) -> ByteWire | FrameWire:
         return self.wires[role]
 

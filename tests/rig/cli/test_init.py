@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
 import tomllib
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
 
 from rig.cli.app import main
+from rig.run.backend import simulated_bench
 from rig.scene.presets import PRESETS
 from rig.scene.scene import load_scene
+from rig.sim.served import ServedBench
+
+FIXTURES = Path(str(files("sim_fixtures")))
 
 
 def say(*arguments: str) -> Result:
@@ -93,6 +99,34 @@ def test_what_cannot_be_leaves_nothing(tmp_path: Path, options: tuple[str, ...],
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
+def test_from_devices_it_writes_ports_and_serial_numbers(tmp_path: Path) -> None:
+    simulated = load_scene(FIXTURES / "scenes" / "cone-4mm.toml")[0]
+    with ServedBench(simulated_bench(simulated)) as served:
+        port = {role: str(keys.get("port", keys.get("can_channel"))) for role, keys in served.ports.items()}
+        where = ["--bus", f"slcan:{port['hv']}@125000"]
+        for role in ("stage", "force", "displacement"):
+            where += ["--port", port[role]]
+        folder = made(tmp_path / "mine", "parker", "--from-devices", *where)
+        scene, text = load_scene(folder / "scene.toml")
+        assert scene.on_real_ports and "[simulation" not in text
+        found = {role: (table.driver, table.serial) for role, table in scene.instruments.items()}
+        assert found == {
+            "stage": ("zaber", "50443"),
+            "force": ("gsv8", "14209876"),
+            "displacement": ("keyence-lkg", None),
+            "hv": ("iseg-edcp", "484216"),
+        }
+        assert scene.stage.approach_from_mm == 0.0  # nobody knows yet where the film is
+        done = say("read", str(folder / "scene.toml"))
+        assert done.exit_code == 0 and "channel off  (iseg E08C 484216)" in done.output, done.output
+        done = say("init", str(tmp_path / "other"), "--yes", "--from-devices", "--port", port["displacement"])
+        assert done.exit_code == 2 and "No instrument answers as stage and force" in done.output
+        assert served.driven == [] and not (tmp_path / "other").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)  # the film's table, the run and the fit of one law each, on a busy machine
 @pytest.mark.parametrize(
     ("preset", "options"),
     [
