@@ -43,7 +43,7 @@ class Telnet:
         self.baud: int | None = None
         self.refused = False
         self._command = bytearray()  # begun and not complete; empty in data
-        self._refused_options: set[tuple[int, int]] = set()
+        self._answered: set[tuple[int, int]] = set()
 
     def opening(self, baud: int) -> bytes:
         """What is asked of the server at first: 8N1 at ``baud``, without flow control."""
@@ -92,11 +92,13 @@ class Telnet:
     def _option(self, verb: int, option: int) -> bytes:
         if verb == DONT and option == COM_PORT:
             self.refused = True
-        known = option in (BINARY, NO_GO_AHEAD) or (option == COM_PORT and verb == DO)
-        if verb in (WONT, DONT) or known or (verb, option) in self._refused_options:
+        asked_by_us = option in (BINARY, NO_GO_AHEAD) or (option == COM_PORT and verb == DO)
+        if verb in (WONT, DONT) or asked_by_us or (verb, option) in self._answered:
             return b""
-        self._refused_options.add((verb, option))
-        return bytes((IAC, WONT if verb == DO else DONT, option))
+        self._answered.add((verb, option))
+        if verb == WILL:
+            return bytes((IAC, DO if option == COM_PORT else DONT, option))
+        return bytes((IAC, WONT, option))
 
     def _subnegotiation(self, what: bytes) -> None:
         if what[:2] == bytes((COM_PORT, FROM_SERVER + SET_BAUDRATE)) and len(what) == 6:
