@@ -126,6 +126,30 @@ def discover(
     return found
 
 
+def renumber(clock: Clock, port: str, *, open_port: Callable[[str, int], ByteLink] | None = None) -> list[Found]:
+    """Give each instrument on a serial line an address of its own, and ask who is there now.
+
+    Nothing moves. Scenes that name the old addresses are wrong afterwards.
+
+    Raises
+    ------
+    DeviceError
+        Nobody there can be given an address, or the port cannot be opened.
+    """
+    opening = open_port or _open_port
+    for _, probe in _serial_probes():
+        for baud in probe.bauds if probe.renumber is not None else ():
+            link = opening(port, baud)
+            try:
+                assert probe.renumber is not None
+                done = probe.renumber(Line(clock, port, baud, link))
+            finally:
+                link.close()
+            if done:
+                return _on_port(clock, port, opening)
+    raise DeviceError(port, "nobody answers there who can be given an address", "Ask who is there with --port.")
+
+
 def _open_port(port: str, baud: int) -> ByteLink:
     from drivers.links.device_server import open_line
 

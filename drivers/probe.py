@@ -108,12 +108,14 @@ class SerialProbe:
     """How it is asked for on a serial port.
 
     ``bauds`` are the line rates that such instruments come with. On each port the probes are tried by rising ``order``
-    until one gets an answer: the smaller, the less harm its question does to other instruments.
+    until one gets an answer: the smaller, the less harm its question does to other instruments. ``renumber`` gives
+    each instrument on a line an address of its own, and is a command: it is sent on demand only. False: nobody there.
     """
 
     ask: Callable[[Line], list[Answered]]
     bauds: tuple[int, ...] = (115_200,)
     order: int = 50
+    renumber: Callable[[Line], bool] | None = None
 
 
 def _hears_nobody(network: Network, frame: CanFrame) -> Answered | None:

@@ -183,6 +183,15 @@ class GivesBack(Protocol):
         ...
 
 
+@runtime_checkable
+class Remarking(Protocol):
+    """A device with something to say that the operator should know, and that ends nothing."""
+
+    def remarks(self) -> list[str]:
+        """What is new since the last call, as sentences without their full stop."""
+        ...
+
+
 class ForceSensor(Device, Protocol):
     """A force sensor that streams at ``rate`` hertz in ``reading_unit`` ("mV/V" for a strain-gauge bridge)."""
 

@@ -32,8 +32,11 @@ class InstrumentSettings(Table):
     """What every instrument has.
 
     ``rate_key`` is the key that says how often it gives a sample. ``place_keys`` are the keys that name its port or
-    bus; without them it is looked for on the simulated bench.
+    bus; without them it is looked for on the simulated bench. ``asks_per_sample`` is how many questions, one after the
+    other, a sample takes; 0 for one that streams.
     """
+
+    asks_per_sample: ClassVar[int] = 1
 
     rate_key: ClassVar[str] = "poll_rate_Hz"
     place_keys: ClassVar[tuple[str, ...]] = ()

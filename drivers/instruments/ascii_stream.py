@@ -56,6 +56,7 @@ class AsciiSettings(SerialSettings):
     """A sensor that sends lines with numbers by itself."""
 
     rate_key: ClassVar[str] = "rate_Hz"
+    asks_per_sample: ClassVar[int] = 0
 
     driver: Literal["ascii-stream"] = Field(description="Sensor that sends lines of text on a serial port by itself.")
     rate_Hz: float = Field(

@@ -44,6 +44,7 @@ class OptoNCDTSettings(SerialSettings):
     """A Micro-Epsilon optoNCDT 1420 on RS-422."""
 
     rate_key: ClassVar[str] = "rate_Hz"
+    asks_per_sample: ClassVar[int] = 0
 
     driver: Literal["optoncdt-1420"] = Field(description="Micro-Epsilon optoNCDT 1420 laser on RS-422.")
     baud: int = Field(default=921_600, gt=0, description="Line rate (bit/s), as set in the sensor.")

@@ -105,6 +105,7 @@ class ShvpsSettings(SupplySettings, SerialSettings):
 
     measures_current: ClassVar[bool] = False
     whole_volts: ClassVar[bool] = True
+    asks_per_sample: ClassVar[int] = 6
 
     driver: Literal["shvps"] = Field(description="shvps (peta-pico-Voltron) high-voltage supply on a serial port.")
     poll_rate_Hz: float = Field(

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Protocol, cast
 
 from drivers.links.link import DeviceError
-from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Sample, Stage
+from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Remarking, Sample, Stage
 from rig.bench.devices import Link, make_device, make_supply
 from rig.bench.opening import Opened
 from rig.bench.tap import Tap
@@ -109,6 +109,28 @@ class Bench:
         if role not in self._opened.links:
             return dict(self._supply.link_settings) if self._supply is not None else {}
         return dict(getattr(self._link(role), "settings", {}))
+
+    def remarks(self, role: str) -> list[str]:
+        """What a device has to say that the operator should know, since the last call."""
+        device = self.devices[role]
+        return device.remarks() if isinstance(device, Remarking) else []
+
+    def too_slow(self, role: str) -> str:
+        """Why an instrument cannot give samples as often as the scene says, by its round trips so far; else nothing."""
+        table, counters = self.scene.instruments[role], self.devices[role].counters
+        trips, asks = counters.get("round_trips", 0), table.asks_per_sample
+        if not trips or not asks:
+            return ""
+        trip_s = 1e-6 * counters["round_trip_sum_us"] / trips
+        if trip_s * asks * table.sample_rate <= 1.0:
+            return ""
+        several = f", and a sample takes {asks}" if asks > 1 else ""
+        timer = self.link_settings(role).get("latency_timer_ms", "")
+        why = f"; the adapter's latency timer is {timer} ms, Linux can set 1" if timer not in ("", "1") else ""
+        return (
+            f"{table.rate_key} = {table.sample_rate:g} Hz cannot be kept: a question has taken {trip_s * 1e3:.1f} ms "
+            f"on average{several}, so at most {1.0 / (trip_s * asks):.3g} Hz{why}"
+        )
 
     def close(self) -> None:
         """Close every device and link, whatever state they are in; one that fails does not keep the others open."""

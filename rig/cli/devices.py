@@ -16,12 +16,24 @@ if TYPE_CHECKING:
 @click.command("devices")
 @click.option("--port", "ports", multiple=True, help="Ask on this serial port only.")
 @click.option("--bus", "buses", multiple=True, metavar="INTERFACE:CHANNEL[@BITRATE]", help="Ask on this CAN bus only.")
-def command(ports: tuple[str, ...], buses: tuple[str, ...]) -> None:
-    """List who answers on which port and bus, and propose the lines for a scene. Sends only questions."""
+@click.option(
+    "--renumber",
+    metavar="PORT",
+    help="Give each device on this serial line an address of its own; asks before. Scenes name addresses.",
+)
+@click.option("--yes", is_flag=True, help="Renumber without asking.")
+def command(ports: tuple[str, ...], buses: tuple[str, ...], renumber: str | None, yes: bool) -> None:
+    """List who answers on which port and bus, and propose the lines for a scene. Sends only questions.
+
+    With --renumber the devices on one line get new addresses: for two that answer to the same one.
+    """
     from drivers.discovery import Bus, discover
     from rig.base.clock import RealClock
     from rig.cli.show import show
 
+    if renumber is not None:
+        show(*devices_table(_renumbered(renumber, yes)))
+        return
     try:
         named = [Bus.parse(text) for text in buses]
     except ValueError as error:
@@ -31,6 +43,20 @@ def command(ports: tuple[str, ...], buses: tuple[str, ...]) -> None:
     show(*devices_table(found))
     if not everywhere and not all(one.role for one in found):
         click.get_current_context().exit(1)
+
+
+def _renumbered(port: str, yes: bool) -> list[Found]:
+    from drivers.discovery import renumber
+    from drivers.links.link import DeviceError
+    from rig.base.clock import RealClock
+    from rig.base.errors import ConfigError
+
+    if not yes:
+        click.confirm(f"Give all devices on {port} new addresses? Nothing moves; scenes name addresses", abort=True)
+    try:
+        return renumber(RealClock(), port)
+    except DeviceError as error:
+        raise ConfigError(str(error)) from None
 
 
 def devices_table(found: Sequence[Found]) -> list[RenderableType]:

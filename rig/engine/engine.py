@@ -268,6 +268,8 @@ class Engine:
         self.recorder.identity(role, found, {**device.settings, **link_settings})
         if remark := link_settings.get("remark"):
             self._remark(role, remark)
+        if slow := self.bench.too_slow(role):
+            self._remark(role, slow)
         if table.serial is not None and table.serial != found.serial:
             raise ConfigError(
                 f"{role}: serial number {table.serial} is wanted, but {found.serial or 'no serial number'} "
@@ -415,6 +417,8 @@ class Engine:
             now = self.clock.now()
             for sample in self.bench.poll(role, now):
                 self._take(role, sample, now)
+            for remark in self.bench.remarks(role):
+                self._remark(role, remark)
         now = self.clock.now()
         if step := self._host.check():
             message = f"the host's calendar was set by {step:+.3f} s; this log goes on by the calendar as it was"

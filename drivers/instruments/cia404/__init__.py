@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -18,6 +18,8 @@ from drivers.settings import CanSettings, ForceSettings, Positive
 
 class CiA404Settings(ForceSettings, CanSettings):
     """A load cell on CANopen by device profile CiA 404; its certificate corrects the newtons that it states."""
+
+    asks_per_sample: ClassVar[int] = 0
 
     driver: Literal["cia404"] = Field(description="Load cell on CANopen, device profile CiA 404.")
     node: int = Field(default=1, ge=1, le=127, description="Node number on the bus.")

@@ -25,6 +25,21 @@ from drivers.roles import Identity
 
 PROFILE = 404
 FLOAT_VALUE, INT16_VALUE, INT24_VALUE, INT32_VALUE, STATUS = 0x6130, 0x7130, 0x8130, 0x9130, 0x6150
+IDENTITY = 0x1018
+_EMERGENCIES = {
+    0x10: "a fault of its own kind",
+    0x20: "current",
+    0x30: "voltage",
+    0x40: "temperature",
+    0x50: "its hardware",
+    0x60: "its software",
+    0x70: "an additional module",
+    0x80: "monitoring",
+    0x81: "communication on the bus",
+    0x82: "a protocol error",
+    0x90: "an external fault",
+}
+"""By the upper byte of an emergency code (CiA 301), or its upper half where no more is said there."""
 AUTOZERO, UNIT, DECIMALS = 0x6125, 0x6131, 0x6132
 TPDO1_PARAMETERS, TPDO1_MAPPING = 0x1800, 0x1A00
 
@@ -130,6 +145,12 @@ def download_request(node: int, index: int, sub: int, value: bytes) -> CanFrame:
 def autozero_request(node: int, channel: int) -> CanFrame:
     """Tare, as Baumer documents it: the size is not indicated."""
     return CanFrame(0x600 + node, struct.pack("<BHB4s", 0x22, AUTOZERO, channel, b"zero"))
+
+
+def emergency_in_words(code: int) -> str:
+    """What an emergency code (CiA 301) is about."""
+    what = _EMERGENCIES.get(code >> 8) or _EMERGENCIES.get(code >> 8 & 0xF0) or "a fault that only its manual explains"
+    return f"{what} (emergency {code:04X})"
 
 
 def identity(vendor: int | None, product: int | None, revision: int | None, serial: int | None) -> Identity:

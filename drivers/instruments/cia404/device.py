@@ -15,6 +15,7 @@ from drivers.instruments.cia404.codec import (
     AUTOZERO,
     DECIMALS,
     FLOAT_VALUE,
+    IDENTITY,
     PROFILE,
     STATUS,
     TPDO1_MAPPING,
@@ -32,6 +33,7 @@ from drivers.instruments.cia404.codec import (
     Uploaded,
     autozero_request,
     download_request,
+    emergency_in_words,
     identity,
     nmt,
     unit_of,
@@ -153,6 +155,8 @@ class CiA404:
             heard=self._heard,
         )
         self._layout = Layout((), channel)
+        self._identifying: dict[int, bytes] = {}
+        self._remarks: list[str] = []
         self._stream: Stream[ForceSample] | None = None
         self._emergency = 0
         self._inbox: deque[CanFrame] = deque()
@@ -180,6 +184,11 @@ class CiA404:
         self._dialogue.begin(self._zero())
         self._next_poll = -math.inf
 
+    def remarks(self) -> list[str]:
+        """Emergencies that it reports, in words."""
+        told, self._remarks = self._remarks, []
+        return told
+
     def close(self) -> None:
         self._link.close()
 
@@ -203,6 +212,9 @@ class CiA404:
                         arrived.append(self._sample(data))
                 case Emergency(code, _):
                     self.counters["emergencies"] += code != 0
+                    if code != self._emergency:
+                        told = f"the device reports {emergency_in_words(code)}" if code else "its emergency is over"
+                        self._remarks.append(told)
                     self._emergency = code
                     self.settings["last_emergency"] = f"{code:04X}"
                 case NodeState(state):
@@ -210,6 +222,7 @@ class CiA404:
                 case answer:
                     if not self._dialogue.offer(answer, now):
                         self.counters["unexpected_answers"] += 1
+                        self._judge_second(answer)
         self._dialogue.run(now)
         stream = self._stream
         look = now + self._interval if stream is None else stream.next_poll(now)
@@ -233,6 +246,19 @@ class CiA404:
             self.counters["bad_values"] += 1
             return ForceSample(math.nan, math.nan, flags | SampleFlag.NO_VALUE)
         return ForceSample(math.nan, reading, flags)
+
+    def _judge_second(self, answer: Message) -> None:
+        """A late answer is the same again; another one to a question who it is comes from somebody else."""
+        if not isinstance(answer, Uploaded) or answer.index != IDENTITY:
+            return
+        first = self._identifying.get(answer.sub, answer.value)
+        if first != answer.value:
+            one, other = (int.from_bytes(value, "little") for value in (first, answer.value))
+            raise DeviceRefused(
+                self._label,
+                f"two devices answer as node {self._node} (1018h:{answer.sub} is {one} and {other})",
+                "Give each its own node number with the maker's tool, one at a time on the bus.",
+            )
 
     def _check_state(self, state: int) -> None:
         if state != 0 or self._stream is None:
@@ -260,6 +286,8 @@ class CiA404:
         if isinstance(answer, Aborted):
             return answer
         assert isinstance(answer, Uploaded)
+        if index == IDENTITY:
+            self._identifying[sub] = answer.value
         return int.from_bytes(answer.value[:length], "little")
 
     def _write(self, index: int, sub: int, value: bytes) -> Generator[_Step, _Got, Aborted | None]:
@@ -281,7 +309,7 @@ class CiA404:
             )
         identifying: list[int | None] = []
         for sub in range(1, 5):
-            answer = yield from self._read(0x1018, sub, 4)
+            answer = yield from self._read(IDENTITY, sub, 4)
             identifying.append(None if isinstance(answer, Aborted) else answer)
         self.identity = identity(*identifying)
         self._layout = yield from self._map()

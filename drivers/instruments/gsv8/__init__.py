@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -27,6 +27,8 @@ _OVERHEAD = 4
 
 class GSV8Settings(ForceSettings, SerialSettings):
     """An ME-Messsysteme GSV-8 with a strain-gauge force sensor; its certificate turns mV/V into newtons."""
+
+    asks_per_sample: ClassVar[int] = 0
 
     driver: Literal["gsv8"] = Field(description="GSV-8 or GSV-6 strain-gauge amplifier on a serial port.")
     baud: int = Field(default=230_400, gt=0, description="Line rate (bit/s), as set in the amplifier.")

@@ -31,6 +31,7 @@ class IsegSettings(SupplySettings, CanSettings):
     """One channel of an iseg supply that speaks EDCP on CAN."""
 
     measures_current: ClassVar[bool] = True
+    asks_per_sample: ClassVar[int] = 6
 
     driver: Literal["iseg-edcp"] = Field(description="iseg high-voltage supply, EDCP on CAN.")
     module: int = Field(default=0, ge=0, le=63, description="Module number on the bus.")

@@ -40,6 +40,8 @@ from drivers.instruments.iseg_edcp.exchange import (
     SWITCH_ON_WAIT_S,
     Exchange,
     Script,
+    check_arguments,
+    judge_second,
     names_of,
     value_of,
 )
@@ -96,17 +98,7 @@ class IsegEDCP:
         boot_s: float = 0.0,
     ) -> None:
         where = label(name, link)
-        if not 0 <= module <= 63:
-            raise DeviceRefused(where, f"module number {module} does not exist", "Allowed: 0 to 63.")
-        if not 0 <= channel <= 255:
-            raise DeviceRefused(
-                where, f"channel {channel} does not exist", "Allowed: 0 to 255, as the module has them."
-            )
-        if not 0 < poll_rate_Hz <= 100:
-            raise DeviceRefused(where, f"poll rate {poll_rate_Hz} Hz is not possible", "Allowed: above 0, at most 100.")
-        if status_bit_5 not in edcp.STATUS_BIT_5:
-            allowed = ", ".join(edcp.STATUS_BIT_5)
-            raise DeviceRefused(where, f"status_bit_5 {status_bit_5!r} is not known", f"Allowed: {allowed}.")
+        check_arguments(where, module, channel, poll_rate_Hz, status_bit_5)
         self.name = name
         self._label = where
         self._bit_5 = status_bit_5
@@ -271,6 +263,7 @@ class IsegEDCP:
                 self._lost_settings = True  # it may have been switched off and on, and lost what was set
             elif message is not None and not self._dialogue.offer(message, now) and not self._collect(message):
                 self.counters["unexpected_frames"] += 1
+                judge_second(self._label, self._module, self.identity.serial, message)
         if self._dialogue.idle:
             if not self._ready:
                 self._link.write(log_on(self._module))
@@ -396,6 +389,7 @@ class IsegEDCP:
                 "Writes could not be verified. End the other program, or switch receive_own_messages off.",
             )
         serial = yield from self._optional(edcp.SERIAL_NUMBER, repeat=True)
+        self.identity = identity(serial, None, None)
         release = yield from self._optional(edcp.FIRMWARE_RELEASE)
         firmware = yield from self._optional(edcp.FIRMWARE_NAME)
         channels = yield from self._optional(edcp.CHANNEL_COUNT)

@@ -7,8 +7,8 @@ from enum import IntFlag
 from typing import TypeVar
 
 from drivers.dialogue import Answer, Ask
-from drivers.instruments.iseg_edcp.codec import Data, Item, Message, Value
-from drivers.links.link import CanFrame
+from drivers.instruments.iseg_edcp.codec import SERIAL_NUMBER, STATUS_BIT_5, Data, Item, Message, Value
+from drivers.links.link import CanFrame, DeviceRefused
 
 T = TypeVar("T")
 
@@ -46,3 +46,26 @@ def value_of(answer: Answer[Message]) -> Value:
 
 def names_of(flags: IntFlag) -> str:
     return " ".join(str(flag.name) for flag in flags)
+
+
+def check_arguments(where: str, module: int, channel: int, poll_rate_Hz: float, status_bit_5: str) -> None:
+    """Refuse what no module can have."""
+    if not 0 <= module <= 63:
+        raise DeviceRefused(where, f"module number {module} does not exist", "Allowed: 0 to 63.")
+    if not 0 <= channel <= 255:
+        raise DeviceRefused(where, f"channel {channel} does not exist", "Allowed: 0 to 255, as the module has them.")
+    if not 0 < poll_rate_Hz <= 100:
+        raise DeviceRefused(where, f"poll rate {poll_rate_Hz} Hz is not possible", "Allowed: above 0, at most 100.")
+    if status_bit_5 not in STATUS_BIT_5:
+        allowed = ", ".join(STATUS_BIT_5)
+        raise DeviceRefused(where, f"status_bit_5 {status_bit_5!r} is not known", f"Allowed: {allowed}.")
+
+
+def judge_second(where: str, module: int, serial: str, message: Data) -> None:
+    """A late answer is the same again; another serial number is another module's."""
+    if message.item is SERIAL_NUMBER and serial not in ("", f"{message.value!s}"):
+        raise DeviceRefused(
+            where,
+            f"two modules answer as {module}, serial numbers {serial} and {message.value!s}",
+            "Give each its own address, one at a time on the bus.",
+        )

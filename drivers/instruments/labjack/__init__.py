@@ -36,6 +36,7 @@ class AmplifierSettings(SupplySettings, TcpSettings):
     """An analogue HV amplifier, driven and measured by a LabJack."""
 
     measures_current: ClassVar[bool] = True
+    asks_per_sample: ClassVar[int] = 4
 
     driver: Literal["labjack-amplifier"] = Field(description="Analogue HV amplifier through a LabJack T4, T7 or T8.")
     preset: Literal["trek-610e", "trek-609e-6", "ultravolt-5hva", "matsusada-amt-5b20"] | None = Field(

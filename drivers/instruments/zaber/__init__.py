@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from typing import Literal
 
 from pydantic import Field
@@ -39,8 +40,36 @@ class ZaberSettings(StageSettings, SerialSettings):
 
 def _ask(line: Line) -> list[Answered]:
     codec = Codec()
-    replies = (m for m in line.ask(encode(0, 0, 0, ""), codec.feed) if isinstance(m, Reply))
-    return [_identified(line, codec, device) for device in sorted({reply.device for reply in replies if reply.id == 0})]
+    replies = [m for m in line.ask(encode(0, 0, 0, ""), codec.feed) if isinstance(m, Reply) and m.id == 0]
+    devices = Counter(reply.device for reply in replies)
+    return [
+        _identified(line, codec, device) if count == 1 else _confused(line, codec, device)
+        for device, count in sorted(devices.items())
+    ]
+
+
+def _confused(line: Line, codec: Codec, device: int) -> Answered:
+    """Several devices with one address: each command is carried out by all of them."""
+    replies = [m for m in line.ask(encode(device, 0, 1, "get system.serial"), codec.feed) if isinstance(m, Reply)]
+    serials = [reply.data for reply in replies if (reply.device, reply.id) == (device, 1) and reply.accepted]
+    return Answered(
+        Identity("Zaber devices", " ".join(serials)),
+        {},
+        f"{max(len(serials), 2)} devices have address {device} and would move together. "
+        f"dea-rig devices --renumber {line.port} gives each an address of its own.",
+        usable=False,
+    )
+
+
+def _renumber(line: Line) -> bool:
+    """Addresses by place on the line, the nearest to the computer first."""
+    codec = Codec()
+    if not any(isinstance(m, Reply) for m in line.ask(encode(0, 0, 0, ""), codec.feed)):
+        return False
+    for data in (encode(0, 0, 1, "renumber"), b"", b"", b""):  # it takes half a second and more
+        for _ in line.ask(data, codec.feed):
+            pass
+    return True
 
 
 def _identified(line: Line, codec: Codec, device: int) -> Answered:
@@ -96,6 +125,6 @@ INSTRUMENTS = (
         settings=ZaberSettings,
         device=ZaberStage,
         dialect=NumberedLines(b"\n"),
-        probe=SerialProbe(_ask, bauds=(115_200, 9_600), order=10),
+        probe=SerialProbe(_ask, bauds=(115_200, 9_600), order=10, renumber=_renumber),
     ),
 )

@@ -123,6 +123,8 @@ class ZaberStage:
         self._flags: tuple[str, ...] = ()
         self._referenced = self._reference_lost = False
         self._faults_told: set[str] = set()
+        self._warned: set[str] = set()
+        self._remarks: list[str] = []
         self._step = math.nan
         self._travel_steps = (0, 0)
         self._acceleration = math.nan  # m/s^2
@@ -247,6 +249,11 @@ class ZaberStage:
         self._next_poll = min(self._urgent.next_poll(now), self._dialogue.next_poll(now), due)
         samples, self._samples = self._samples, []
         return samples
+
+    def remarks(self) -> list[str]:
+        """Warning flags that are new, in words."""
+        told, self._remarks = self._remarks, []
+        return told
 
     def close(self) -> None:
         """Stop if moving, give settings back that were changed, all without waiting, and release the line."""
@@ -497,6 +504,10 @@ class ZaberStage:
         if had_reference and not self._referenced and not self._homing:
             self._reference_lost = True
         self._faults_told.intersection_update(flags)
+        warned = {flag for flag in flags if flag.startswith("W")} - UNREFERENCED
+        if new := sorted(warned - self._warned):
+            self._remarks.append(f"the stage warns of {_in_words(new)}")
+        self._warned = warned
 
     def _judge(self) -> None:
         """Raise what the operator must know, once."""
