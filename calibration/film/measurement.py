@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 from calibration.film.curve import Curve
-from calibration.film.propagation import SYSTEMATIC
 from calibration.film.result import Measurement, Quantity
+from calibration.film.systematic import SYSTEMATIC
 
 FACTOR = 5.0  # by which a measurement that is made for the purpose is better than what is known
 WORTH_SAYING = 0.9  # factor by which it must shrink an uncertainty at least

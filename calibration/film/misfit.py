@@ -5,6 +5,10 @@ hides in it although it biases the result. So the residuals are also held agains
 ``d`` the change of the weighted residuals by one unit of it, and ``P`` the projection off everything that the fitted
 parameters can do, its amplitude is ``a = -d P r / |P d|^2`` with standard uncertainty ``1/|P d|`` (a score test).
 
+Gains and dimensions are not fitted, and what their stated uncertainties do to the data is no imperfection: it counts
+as a part of the noise, so that the test asks for what lies beyond. With ``D`` those changes, one column for each
+standard uncertainty, the products above are taken with ``C^-1 = (1 + P D D^T P)^-1``.
+
 What the parameters can do for themselves no test finds (Neyman & Pearson 1933): an imperfection that looks much like
 another stiffness or permittivity biases them before it shows. So each suspect also tells from which size on it would
 be reported, and what it does to the result until then. Suspects that explain the residuals equally well are named
@@ -25,6 +29,7 @@ from calibration.film.problem import Problem
 from calibration.film.result import SIGNIFICANT, Suspect
 from calibration.film.suspects.base import Kind
 from calibration.film.suspects.registry import kinds
+from calibration.film.systematic import systematic_rows
 
 Array = NDArray[np.float64]
 
@@ -49,24 +54,50 @@ class _Seen:
     uncertainty: float  # inf where the parameters do all that it does
 
 
+class _Left:
+    """What the fit leaves over of residual rows, and ``C^-1`` there, with the errors that are stated and not fitted."""
+
+    def __init__(self, problem: Problem, x: Array, free: NDArray[np.bool_]) -> None:
+        base, s, _ = np.linalg.svd(problem.jacobian(x)[:, free], full_matrices=False)
+        self.base = base[:, s > 1e-10 * s[0]]
+        self.residual = problem.residual(x)
+        stated = np.array(list(systematic_rows(problem, x).values())).reshape(-1, self.residual.size).T
+        self.columns = self.of(stated)  # (residuals, errors)
+        self.inner = np.linalg.inv(np.eye(stated.shape[1]) + self.columns.T @ self.columns)
+
+    def of(self, rows: Array) -> Array:
+        """Rows without what the parameters can do."""
+        return np.asarray(rows - self.base @ (self.base.T @ rows))
+
+    def weighed(self, rows: Array) -> Array:
+        """``C^-1`` times rows that the parameters leave over (Woodbury)."""
+        return np.asarray(rows - self.columns @ (self.inner @ (self.columns.T @ rows)))
+
+
+def beyond(problem: Problem, x: Array, free: NDArray[np.bool_]) -> float:
+    """Chi-square of the residuals beyond what gains and dimensions do within their stated uncertainties."""
+    left = _Left(problem, x, free)
+    visible = left.of(left.residual)
+    return float(visible @ left.weighed(visible))
+
+
 def suspects(problem: Problem, x: Array, free: NDArray[np.bool_]) -> list[Suspect]:
     """The imperfections that this data could show, most probable first."""
-    base, s, _ = np.linalg.svd(problem.jacobian(x)[:, free], full_matrices=False)
-    base = base[:, s > 1e-10 * s[0]]
-    residual = problem.residual(x)
-    context = problem.context(x)
+    left, context = _Left(problem, x, free), problem.context(x)
     found = []
     for kind in kinds():
         if kind.key and kind.key in context.fitted:
             continue
         for shape in kind.shapes(context):
-            visible = shape.rows - base @ (base.T @ shape.rows)
+            visible = left.of(shape.rows)
             size, whole = float(np.linalg.norm(visible)), float(np.linalg.norm(shape.rows))
             if not math.isfinite(size) or whole == 0.0:
                 continue
             shown = size > VISIBLE * whole
-            amplitude = -float(visible @ residual) / size**2 if shown else 0.0
-            found.append(_Seen(kind, shape.name, shape.rows, amplitude, 1.0 / size if shown else math.inf))
+            weighed = left.weighed(visible)
+            square = float(visible @ weighed)
+            amplitude = -float(weighed @ left.residual) / square if shown else 0.0
+            found.append(_Seen(kind, shape.name, shape.rows, amplitude, square**-0.5 if shown else math.inf))
     count = max(1, sum(math.isfinite(one.uncertainty) for one in found))
     return sorted((_judged(one, count) for one in found), key=lambda one: (one.probability, one.shows_from))
 

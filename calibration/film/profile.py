@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.problem import Problem
-from calibration.film.propagation import NUISANCES, SYSTEMATIC, Covariance, secant, shear_slopes
+from calibration.film.propagation import NUISANCES, Covariance, secant, shear_slopes
 from calibration.film.result import Quantity, verdict
 from calibration.film.search import Minimum, minimise_many
+from calibration.film.systematic import SYSTEMATIC
 
 Array = NDArray[np.float64]
 Target = Callable[[Array], tuple[float, Array]]  # value and gradient of a quantity at x

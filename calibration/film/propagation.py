@@ -10,27 +10,15 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.curve import Curve
 from calibration.film.misfit import likely
 from calibration.film.problem import DIMENSIONS, Problem
 from calibration.film.result import Quantity, RigParameter, Stiffness, Suspect, verdict
+from calibration.film.systematic import systematic_rows
 from model.material.law import Law, stack
 from model.material.materials import Material
 
 Array = NDArray[np.float64]
 
-# Systematic effects: entry in the budget, the curve's field with its relative standard uncertainty, what it scales.
-SYSTEMATIC = (
-    ("force gain", "force_gain", "force"),
-    ("displacement gain", "displacement_gain", "h"),
-    ("displacement axis", "displacement_axis", "h"),
-    ("voltage gain", "voltage_gain", "voltage"),
-    ("voltage at the film", "voltage_at_film", "voltage"),
-    ("thickness", "thickness_uncertainty", "thickness"),
-    ("pre-stretch", "prestretch_uncertainty", "prestretch"),
-    ("disk radius", "disk_radius_uncertainty", "disk_radius"),
-    ("ring radius", "ring_radius_uncertainty", "ring_radius"),
-)
 # Entries of the budget that belong to the specimen: a result "given the dimensions" is without them.
 OF_DIMENSIONS = {"thickness": "thickness", "prestretch": "pre-stretch", "disk_radius": "disk radius"}
 OF_DIMENSIONS |= {"ring_radius": "ring radius"}
@@ -40,16 +28,6 @@ NUISANCES = {"force_zero": "N", "displacement_zero": "m", "lag": "s", "complianc
 # Meridional stretch over pre-stretch to which a stiffness belongs that can be compared between runs.
 FIXED = 1.25
 NEGLIGIBLE = 1e-3  # of the noise: what is less has no line in a budget
-
-
-def stiffening(curve: Curve) -> float:
-    """Relative rise of the force when the disk sits off the ring's centre by the curve's ``eccentricity``.
-
-    A membrane under even tension carries the disk like a field its charge: the stiffness goes with the capacitance of
-    the two circles, ``1/arcosh((a^2 + b^2 - e^2)/(2 a b))``. It can only rise; the rise is taken as its uncertainty.
-    """
-    a, b, e = curve.specimen.disk_radius, curve.specimen.ring_radius, curve.eccentricity
-    return math.log(b / a) / math.acosh((a * a + b * b - e * e) / (2.0 * a * b)) - 1.0 if e > 0.0 else 0.0
 
 
 def secant_modulus(material: Material, meridional: float, hoop: float) -> float:
@@ -179,26 +157,8 @@ class Propagation:
         self.biases = [self.response @ (one.amplitude * one.shape) for one in likely(doubts)]
         self.rivals = rivals
         self.effects: dict[str, Array] = {}
-        states = problem.states(x)
-        for part, uncertainty, scales in SYSTEMATIC:
-            relative = np.array([getattr(problem.curves[i], uncertainty) for i in problem.active])[:, None]
-            if scales in DIMENSIONS:
-                relative = relative * problem.common(scales)
-            if relative.any():
-                change = states.force if scales == "force" else states.by[scales] * self._size(scales)
-                self.effects[part] = self.response @ problem.project((relative * change)[..., None])[:, 0]
-        tilted = np.array([stiffening(problem.curves[i]) for i in problem.active])[:, None]
-        if tilted.any():
-            shift = problem.project((tilted * states.force)[..., None])[:, 0]
-            self.effects["eccentricity"] = self.response @ shift
-
-    def _size(self, name: str) -> Array:
-        """Displacement, voltage or a dimension of the specimen at the nodes of every active curve."""
-        if name == "h":
-            return self.problem.nodes
-        if name == "voltage":
-            return self.problem.voltage[:, None]
-        return np.array([[getattr(self.problem.curves[i].specimen, name)] for i in self.problem.active])
+        for part, rows in systematic_rows(problem, x).items():
+            self.effects[part] = self.response @ rows
 
     def label(self, kind: str) -> str:
         """The entry of the budget for errors of a kind that are fitted along."""

@@ -300,7 +300,8 @@ class Identification:
     chi_square, freedom : float, int
         Of all samples, in their stated standard deviations.
     lack_of_fit, lack_of_fit_freedom, lack_of_fit_probability : float, int, float
-        Misfit that smooth curves would not have, in the noise found, and the probability of as much by chance.
+        Misfit that smooth curves would not have, in the noise found and beyond what gains and dimensions do within
+        their stated uncertainties, and the probability of as much by chance.
     likely : list of str
         Names of the suspects that the residuals look like and that these data cannot tell apart, best first.
     along : dict of str to dict of str to float

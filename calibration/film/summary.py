@@ -14,7 +14,7 @@ from scipy.special import gammaincc
 from calibration.film.identifiability import advice
 from calibration.film.measurement import assumed_parts, most_useful
 from calibration.film.minima import MOST_STEPS, SAME_MINIMUM, Fit
-from calibration.film.misfit import likely, suspects
+from calibration.film.misfit import beyond, likely, suspects
 from calibration.film.problem import TOLERANCE, IdentificationError, Problem
 from calibration.film.profile import intervals, targets, widened
 from calibration.film.propagation import determined, least_tangent, state
@@ -60,10 +60,12 @@ def summarise(
     misfit_freedom = problem.data_rows - free
     if misfit_freedom <= 0:
         raise IdentificationError(f"{problem.data_rows} independent values cannot determine {free} parameters")
-    probability = float(gammaincc(misfit_freedom / 2, fit.cost / 2))
-    misfit = fit.cost / misfit_freedom if probability < SIGNIFICANT else 1.0
+    seen = determined(problem, fit.at_bound, held)
+    lack = min(beyond(problem, x, seen), fit.cost)
+    probability = float(gammaincc(misfit_freedom / 2, lack / 2))
+    misfit = lack / misfit_freedom if probability < SIGNIFICANT else 1.0
     rivals = [(other.problem.film(other.x), math.exp((fits[0].cost - other.cost) / 2 / misfit)) for other in fits]
-    doubts = suspects(problem, x, determined(problem, fit.at_bound, held))
+    doubts = suspects(problem, x, seen)
     stated = state(
         problem,
         x,
@@ -101,7 +103,7 @@ def summarise(
         nuisance=stated.nuisance,
         chi_square=chi_square,
         freedom=used - free,
-        lack_of_fit=fit.cost,
+        lack_of_fit=lack,
         lack_of_fit_freedom=misfit_freedom,
         lack_of_fit_probability=probability,
         likely=[one.name for one in suspected],

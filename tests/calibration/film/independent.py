@@ -86,12 +86,15 @@ def measured(
     samples: int = 240,
     voltages: Sequence[float] = VOLTAGES,
     believed: str = "cone",
+    noise: tuple[float, float] = (NOISE_N, DISPLACEMENT_NOISE_M),
+    zeros: tuple[float, float] = (FORCE_ZERO_N, DISPLACEMENT_ZERO_M),
 ) -> list[Curve]:
     """Curves of one run with one film.
 
     ``stated`` are the relative standard uncertainties that the curves state, ``errors`` the factors of the truth over
     what is believed (drawn, if they are not given). ``voltage_of`` tells the true voltage of every sample where it is
-    not that of the supply, ``reading_of`` the sensor's reading at a true displacement.
+    not that of the supply, ``reading_of`` the sensor's reading at a true displacement. ``noise`` and ``zeros`` are the
+    standard deviations of force (N) and displacement (m).
     """
     film = Cone(**ONE_TERM) if truth is None else truth
     nominal = Specimen(film.a, film.b, film.thickness, film.prestretch, GUESS, name=believed)
@@ -102,8 +105,7 @@ def measured(
         a=film.a * wrong.get("disk_radius_uncertainty", 1.0),
         b=film.b * wrong.get("ring_radius_uncertainty", 1.0),
     )
-    force_zero = FORCE_ZERO_N * random.standard_normal()
-    displacement_zero = DISPLACEMENT_ZERO_M * random.standard_normal()
+    force_zero, displacement_zero = (size * random.standard_normal() for size in zeros)
     curves = []
     factor = wrong.get("voltage_at_film", 1.0)
     levels = [one * factor for one in voltages]
@@ -124,16 +126,16 @@ def measured(
                 specimen=nominal,
                 h=reading_of(sweep.h) * wrong.get("displacement_axis", 1.0)
                 + displacement_zero
-                + DISPLACEMENT_NOISE_M * random.standard_normal(count),
-                force=force * wrong.get("force_gain", 1.0) + force_zero + NOISE_N * random.standard_normal(count),
+                + noise[1] * random.standard_normal(count),
+                force=force * wrong.get("force_gain", 1.0) + force_zero + noise[0] * random.standard_normal(count),
                 voltage=np.full(count, sweep.voltage),
                 nominal_voltage=sweep.voltage,
                 direction=sweep.direction,
                 time=sweep.time,
-                force_noise=NOISE_N,
-                displacement_noise=DISPLACEMENT_NOISE_M,
-                force_zero=FORCE_ZERO_N,
-                displacement_zero=DISPLACEMENT_ZERO_M,
+                force_noise=noise[0],
+                displacement_noise=noise[1],
+                force_zero=zeros[0],
+                displacement_zero=zeros[1],
                 **stated,  # type: ignore[arg-type] # uncertainties by their fields
             )
         )

@@ -20,7 +20,7 @@ def through_table(curves: Sequence[Curve], stated: Mapping[str, float], folder: 
     columns = np.concatenate(
         [np.stack((one.time, one.h * 1e3, one.force, one.voltage)) for one in curves if one.time is not None], axis=1
     )
-    np.savetxt(table, columns.T, fmt="%.5f", delimiter=",", header="t_s,displacement_mm,force_N,voltage_V", comments="")
+    np.savetxt(table, columns.T, fmt="%.9f", delimiter=",", header="t_s,displacement_mm,force_N,voltage_V", comments="")
     scene.write_text(scene_of(curves[0], stated), encoding="utf-8")
     return read_cones([table], scene, ImportOptions()).curves
 
