@@ -161,17 +161,13 @@ class GivesBack(Protocol):
     device has confirmed that all of them are as in ``found``; `close` puts back the rest without waiting.
     """
 
-    name: str
-    identity: Identity
-    found: dict[str, int]
+    @property
+    def found(self) -> Mapping[str, float]: ...
 
     @property
     def given_back(self) -> bool: ...
 
-    @property
-    def next_poll(self) -> float: ...
-
-    def resume_found(self, found: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+    def resume_found(self, found: Mapping[str, float]) -> Mapping[str, tuple[float, float]]:
         """Take over what an earlier run found that ended without giving it back: by name what is now and was before.
 
         Nothing, where the device shows that somebody has put it right since.
@@ -216,6 +212,15 @@ class Renewed(Protocol):
     """
 
     def renew(self) -> None: ...
+
+
+@runtime_checkable
+class OwnTrip(Protocol):
+    """A supply that takes its output off by itself, when it is told beforehand what is too much."""
+
+    def arm_trip(self, volts: float, amperes: float) -> None:
+        """Report a voltage that is ``volts`` away from the set-point; trip when more than ``amperes`` are drawn."""
+        ...
 
 
 class HVSupply(Device, Protocol):

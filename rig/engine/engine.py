@@ -20,18 +20,19 @@ from drivers.roles import HVSample, Sample
 from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.base.host import HostTime
 from rig.bench.bench import Bench
-from rig.engine.lent import Lent
+from rig.engine.lent import Lent, wait_given_back
 from rig.engine.look import Outlook
 from rig.engine.outcome import NOT_SAFE_STATUS, Outcome
 from rig.engine.pause import pause
 from rig.engine.teardown import Rest, Teardown
 from rig.engine.watch import Watch, allowed_silence
 from rig.log.recorder import Gains, Recorder, Severity
+from rig.log.schema import SETTINGS
 from rig.operator.control import Control
 from rig.operator.status import Status
 from rig.safety import heartbeat
 from rig.safety.arming import Arming
-from rig.safety.guard import SAFE_VOLTAGE, AnyGuard, Guard, GuardState
+from rig.safety.guard import GIVE_BACK, SAFE_VOLTAGE, AnyGuard, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limit, Limits
 from rig.steps.base import Action, Result, Turns, write_phase
 from rig.steps.output import choose_about_live_output, confirm_voltage
@@ -171,6 +172,9 @@ class Engine:
             ended + SNAPSHOT_S - ROUNDING_S if snapshot else ended,
         )
         self._lent.end(rest.standing)
+        guard = self.guard
+        if guard is not None and rest.safe and not guard.given_back:
+            wait_given_back("hv", guard.give_back, lambda: guard.given_back, self.bench, self.recorder)
         if isinstance(error, Stopped):  # not before: a log that fails now stops nothing
             self.recorder.operator("stops", "", self.control.source)
         if snapshot:
@@ -197,7 +201,7 @@ class Engine:
             return
 
         def tell(command: str, argument: str, t: float | None = None) -> None:
-            self.recorder.command("hv", command, argument, t)
+            self.recorder.command("hv" + SETTINGS * (command == GIVE_BACK), command, argument, t)
 
         def event(severity: Severity, message: str) -> None:
             self.recorder.event(severity, "guard", message)

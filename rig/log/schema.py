@@ -23,6 +23,8 @@ from drivers.roles import HVFlag, SampleFlag
 SCHEMA_VERSION = 2
 PACKAGE = "dearig.v2"
 ROLES = ("stage", "force", "displacement", "hv")
+SETTINGS = ".settings"
+"""Of a command's device: it is about settings that were lent, not about what the device does."""
 
 
 class Field(NamedTuple):

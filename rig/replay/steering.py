@@ -42,7 +42,9 @@ WORDS = {
     "switch_on": ("switch_on",),
     "switch_off": ("switch_off",),
     "emergency_off": ("emergency_off",),
+    "give_back": ("give_back",),
 }
+SUPPLY = ("hv", "hv.settings")
 
 
 @dataclass
@@ -185,7 +187,7 @@ def _seconds(ns: int) -> float:
 def _is_decision(topic: str, fields: Mapping[str, Any]) -> bool:
     if counted_device(topic, fields):
         return True
-    return topic in DECISIONS and fields.get("device", "stage") == "stage"
+    return topic in DECISIONS and fields.get("device", "stage") in ("stage", "stage.settings")
 
 
 def _entries(recording: Recording) -> list[_Turn | _Decision]:
@@ -224,7 +226,7 @@ def _supply(rows: Sequence[Row]) -> list[float | _Command]:
         if row.topic.startswith("/raw/hv/"):
             if not found or found[-1] != row.t:
                 found.append(row.t)
-        elif row.topic == "/command" and row.fields["device"] == "hv":
+        elif row.topic == "/command" and row.fields["device"] in SUPPLY:
             found.append(_Command(row.t, row.fields["command"]))
     return found
 

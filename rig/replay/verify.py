@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from drivers.links.link import DeviceError
-from drivers.roles import GivesBack, HVSupply, Renewed, Stage
+from drivers.roles import GivesBack, HVSupply, OwnTrip, Renewed, Stage
 from drivers.settings import CanSettings
 from rig.bench.bench import Bench
 from rig.bench.opening import open_memory
@@ -245,8 +245,8 @@ class _Verifier:
                     self._poll(role)
                 self._streams[role].recorded.append(row)
                 self._compare(role)
-            case ["command"] if row.fields["device"] in self._streams:
-                self._poll(row.fields["device"])
+            case ["command"] if _commanded(row) in self._streams:
+                self._poll(_commanded(row))
                 self._command(row.fields)
             case ["event"] if row.fields["source"] in self._streams and row.fields["source"] != GUARDED:
                 self._poll(row.fields["source"])
@@ -334,7 +334,7 @@ class _Verifier:
         try:
             command(numbers(fields["argument"]))
         except DeviceError as error:
-            self._streams[fields["device"]].error = str(error)
+            self._streams[fields["device"].removesuffix(schema.SETTINGS)].error = str(error)
 
     def _reference(self, name: str, value: float) -> None:
         match name:
@@ -370,6 +370,8 @@ def commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]], 
         supply().set_ramp(values[0])
         if len(values) > 1:
             supply().set_current_limit(values[1])
+        if len(values) > 2:
+            cast(OwnTrip, supply()).arm_trip(values[2], values[1])
 
     def take_down(values: Sequence[float]) -> None:
         supply().set_ramp(values[0])
@@ -392,16 +394,21 @@ def commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]], 
         ("stage", "home"): lambda values: stage().home(),
         ("stage", "move_to"): lambda values: stage().move_to(values[0], values[1]),
         ("stage", "stop"): lambda values: stage().stop(),
-        ("stage", "resume_found"): resume_found,
-        ("stage", "give_back"): lambda values: lender().give_back(),
+        ("stage.settings", "resume_found"): resume_found,
+        ("stage.settings", "give_back"): lambda values: lender().give_back(),
         ("hv", "arm"): arm,
         ("hv", "take_down"): take_down,
         ("hv", "clear"): lambda values: supply().clear(),
         ("hv", "set_voltage"): lambda values: supply().set_voltage(values[0]),
         ("hv", "switch_on"): lambda values: supply().switch_on(),
         ("hv", "switch_off"): lambda values: supply().switch_off(),
+        ("hv.settings", "give_back"): lambda values: cast(GivesBack, supply()).give_back(),
         ("hv", "emergency_off"): lambda values: supply().emergency_off(),
     }
+
+
+def _commanded(row: Row) -> str:
+    return str(row.fields["device"]).removesuffix(schema.SETTINGS)
 
 
 def _in_words(topic: str, payload: bytes) -> str:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from enum import Enum, Flag
 from typing import TYPE_CHECKING, TypeAlias
 
-from drivers.roles import HVFlag, HVSample, HVSupply, Renewed
+from drivers.roles import GivesBack, HVFlag, HVSample, HVSupply, OwnTrip, Renewed
 from rig.base.errors import Breakdown, BreakdownCurrent, FaultError, LimitError, StaleData
 from rig.safety.commanded import DEVIATION_PART, DEVIATION_V, CommandedRamp
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
@@ -36,6 +36,7 @@ AT_ONCE_S = 4.0  # how long an emergency off may take to be measured before the 
 NOT_SAFE = f"NOT SAFE: the output was not measured off (below {SAFE_VOLTAGE:.0f} V, and the channel off)."
 ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
 CHARGING_PART = 0.2  # what the model may be wrong in the film's charging current
+GIVE_BACK = "give_back"
 SAFE_SAMPLES = 2  # consecutive samples that show the output off before we call it safe
 
 DRIVEN = HVFlag.ON | HVFlag.RAMPING  # an output that is driven may be low only for now
@@ -140,11 +141,15 @@ class Guard:
             raise FaultError(f"hv: cannot be armed, the supply reports {flag_names(faults)}. Clear the cause first.")
         limited = self._supply.measures_current
         limit = f"current limit {self._limits.current.high!r} A" if limited else "no current limit"
-        self._tell("arm", f"ramp {self._ramp!r} V/s, {limit}")
+        bounds = max(DEVIATION_V, DEVIATION_PART * self._limits.voltage.high)
+        trips = f", own trip beyond it, bounds {bounds!r} V" if isinstance(self._supply, OwnTrip) else ""
+        self._tell("arm", f"ramp {self._ramp!r} V/s, {limit}{trips}")
         self.commanded = True
         self._supply.set_ramp(self._ramp)
         if limited:
             self._supply.set_current_limit(self._limits.current.high)
+        if isinstance(self._supply, OwnTrip):
+            self._supply.arm_trip(bounds, self._limits.current.high)
         self.state = GuardState.ARMED
         self.cause = ""
         self._alive_at = None
@@ -210,6 +215,17 @@ class Guard:
         self.check_off()
         self._tell("clear", cause)
         self._supply.clear()
+
+    @property
+    def given_back(self) -> bool:
+        """Whether the supply has everything back that arming changed."""
+        return not isinstance(self._supply, GivesBack) or self._supply.given_back
+
+    def give_back(self) -> None:
+        """Put back what arming changed in the supply; only while the output is measured off."""
+        if isinstance(self._supply, GivesBack) and self.output_is_safe and self.state is GuardState.SAFE:
+            self._tell(GIVE_BACK, "")
+            self._supply.give_back()
 
     def request(self, volts: float, h: float) -> None:
         """Ramp the output to ``volts`` with the disk at displacement ``h`` metres.

@@ -29,7 +29,7 @@ from typing import Literal
 import click
 
 from drivers.links.link import DeviceError, DeviceLost
-from drivers.roles import HVSample, HVSupply
+from drivers.roles import GivesBack, HVSample, HVSupply
 from drivers.settings import SupplySettings
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, RigError
@@ -38,8 +38,9 @@ from rig.bench.devices import ROLE, Link, make_supply
 from rig.log.errors import LogError
 from rig.log.recorder import Severity
 from rig.log.remote import RemoteLog
+from rig.log.schema import SETTINGS
 from rig.safety.channel import Channel, ChannelDamaged, Message
-from rig.safety.guard import ADVICE, AT_ONCE_S, NOT_SAFE, Guard, GuardState
+from rig.safety.guard import ADVICE, AT_ONCE_S, GIVE_BACK, NOT_SAFE, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.scene.scene import Scene
 
@@ -50,6 +51,7 @@ INSIST_S = 1.0  # an off that was sent but is not measured is sent again at this
 BEGIN_S = 30.0  # how long the engine may take to say what is to be guarded
 TRY_S = 3600.0  # how long a supply that does not obey is told again after the engine has gone, unless a signal ends it
 ENDING = ("SIGINT", "SIGTERM")  # signals that the guard obeys once its engine has gone and it has said NOT SAFE
+GIVE_BACK_S = 1.0  # how long the supply may take to confirm that it has its settings back
 SPEAK_S = 1.0  # how long the last word may wait for a terminal that takes nothing
 STDERR = 2
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
@@ -63,6 +65,7 @@ MAY_BE_CALLED = (
     "clear_faults",
     "ramp_off",
     "kill",
+    "give_back",
 )
 
 
@@ -333,6 +336,8 @@ class Server:
                 "setpoint": guard.setpoint,
                 "output_is_safe": guard.output_is_safe,
                 "ramp_duration": guard.ramp_duration,
+                "given_back": guard.given_back,
+                "found": dict(supply.found) if isinstance(supply, GivesBack) else {},
                 "ready": supply.ready,
                 "identity": [supply.identity.model, supply.identity.serial, supply.identity.firmware],
                 "settings": supply.settings,
@@ -346,7 +351,8 @@ class Server:
 
     def _tell_command(self, command: str, argument: str) -> None:
         t = self._clock.now()
-        if not self._record("/command", t, device=ROLE, command=command, argument=argument):
+        device = ROLE + SETTINGS * (command == GIVE_BACK)
+        if not self._record("/command", t, device=device, command=command, argument=argument):
             self._channel.send({"is": "command", "command": command, "argument": argument, "t": t})
 
     def _tell_event(self, severity: Severity, message: str) -> None:
@@ -406,6 +412,7 @@ class Server:
             except BaseException as error:
                 self._fault(error)
             self._wait()
+        self._give_back(guard)
         measured = guard.last.voltage if guard.last is not None else float("nan")
         if guard.output_is_safe:
             message = f"{cause}. The high voltage is off, measured {measured:.0f} V."
@@ -416,6 +423,17 @@ class Server:
         end = time.monotonic() + SPEAK_S
         while not self._words.speak() and time.monotonic() < end:
             time.sleep(LONGEST_TURN_S)
+
+    def _give_back(self, guard: Guard) -> None:
+        """The last thing, and without it all is as safe: the supply gets back what arming changed."""
+        assert self._supply is not None
+        end = self._clock.now() + GIVE_BACK_S
+        with suppress(Exception):
+            if guard.output_is_safe and not guard.given_back:
+                guard.give_back()
+            while guard.output_is_safe and not guard.given_back and self._clock.now() < end:
+                self._poll(guard, self._supply)
+                self._wait()
 
 
 def _obey_signals(ended_by: list[int]) -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
-from drivers.roles import HVFlag, HVSample, HVSupply, Identity, Sample
+from drivers.roles import GivesBack, HVFlag, HVSample, HVSupply, Identity, Sample
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, from_fields
 from rig.bench.devices import ROLE, Link, make_supply
@@ -66,6 +66,8 @@ class RemoteGuard:
         self.setpoint = 0.0
         self.output_is_safe = False
         self.ramp_duration = 0.0
+        self.given_back = True
+        self._found: dict[str, float] = {}  # what arming changes in the supply, as the guard found it
         self.last: HVSample | None = None
         self._scene = scene
         self._table = scene.hv
@@ -234,6 +236,9 @@ class RemoteGuard:
     def check_move(self, h0: float, h1: float) -> None:
         self._call("check_move", h0, h1)
 
+    def give_back(self) -> None:
+        self._call("give_back")
+
     def ramp_off(self, cause: str) -> None:
         self._call("ramp_off", cause)
 
@@ -326,6 +331,7 @@ class RemoteGuard:
         self.setpoint = message["setpoint"]
         self.output_is_safe = message["output_is_safe"]
         self.ramp_duration = message["ramp_duration"]
+        self.given_back, self._found = message["given_back"], message["found"]
         self.ready = message["ready"]
         self.identity = Identity(*message["identity"])
         self.settings = message["settings"]
@@ -371,6 +377,8 @@ class RemoteGuard:
             return
         assert self._successor is not None
         self._successor[1].commanded = self.commanded
+        if isinstance(self._successor[0], GivesBack):
+            self._successor[0].resume_found(self._found)
         with suppress(DeviceLost):
             getattr(self._link, "resume", lambda: None)()
         self._off(now)
@@ -426,7 +434,7 @@ class RemoteGuard:
     def _mirror(self, guard: Guard) -> None:
         self.state, self.cause, self.commanded = guard.state, guard.cause, guard.commanded
         self.setpoint, self.output_is_safe = guard.setpoint, guard.output_is_safe
-        self.ramp_duration = guard.ramp_duration
+        self.ramp_duration, self.given_back = guard.ramp_duration, guard.given_back
 
 
 def unpack_error(message: Message) -> Exception:

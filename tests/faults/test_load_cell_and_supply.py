@@ -7,7 +7,8 @@ one number; the supply is on at 1000 V.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +21,10 @@ from model.material.materials import NAMED
 from model.specimen import Specimen
 from rig.base.clock import VirtualClock
 from rig.bench.memory_link import MemoryByteLink, MemoryFrameLink
+from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
 from rig.sim.instruments.gsv8 import GSV8Truth
+from rig.sim.instruments.iseg import DISABLED, OFF_AT_ONCE, IsegTruth
 from rig.sim.settings import SimulationSettings
 from rig.sim.truth import Fault
 from rig.sim.wire import ByteWire, FrameWire
@@ -34,9 +37,11 @@ VOLTS = 1000.0
 class Rig:
     """Load cell and supply, set up; errors are kept with their time."""
 
-    def __init__(self, *, on: bool) -> None:
+    def __init__(self, *, on: bool, channels: int = 1) -> None:
         settings = SimulationSettings(
-            seed=1, force=GSV8Truth(noise_fraction=0.0, zero_offset_mV_per_V=TRUE_READING, stored_rate_Hz=100.0)
+            seed=1,
+            force=GSV8Truth(noise_fraction=0.0, zero_offset_mV_per_V=TRUE_READING, stored_rate_Hz=100.0),
+            hv=IsegTruth(channels=channels),
         )
         self.bench = SimulatedBench(settings, SPECIMEN, {"force", "hv"})
         self.clock = VirtualClock(self.bench.advance)
@@ -252,3 +257,49 @@ def test_output_that_cannot_be_switched_off_goes_on_being_measured(live: Rig) ->
     live.run(0.5)
     assert HVFlag.EMERGENCY_OFF in live.outputs[-1].flags
     assert live.outputs[-1].voltage == pytest.approx(VOLTS, abs=5)
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_armed_the_supply_trips_by_itself_with_nobody_there_to_see_it(channels: int) -> None:
+    """Both processes stopped: from the breakdown on nobody polls, and the output goes all the same."""
+    live = Rig(on=True, channels=channels)
+    live.hv.arm_trip(50.0, 1e-4)
+    live.settle()
+    live.inject("hv", "breakdown")
+    at = live.t
+    live.clock.sleep_until(at + 0.2)
+    assert float(live.bench.world.output.at(live.t)[0]) == 0.0
+    live.run(0.3)
+    assert HVFlag.TRIPPED in live.outputs[-1].flags and HVFlag.ON not in live.outputs[-1].flags
+
+
+def test_unarmed_it_does_not() -> None:
+    live = Rig(on=True)
+    live.inject("hv", "breakdown")
+    live.clock.sleep_until(live.t + 0.2)
+    assert live.bench.world.output.at(live.t)[0] != 0.0
+
+
+@pytest.mark.parametrize("asked", ["stop", "fault"])
+def test_a_run_arms_the_supplys_own_trip_and_gives_everything_back(tell: Callable[..., Any], asked: str) -> None:
+    armed: list[tuple[Any, ...]] = []
+
+    def settings(bench: SimulatedBench) -> tuple[Any, ...]:
+        twin: Any = bench.instruments["hv"]
+        one = twin._channels[0]
+        own = (one.current_limit, one.v_bounds, one.i_bounds, one.trip_delay_ms, one.trip_action)
+        return (twin._ramp_percent, twin._kill, *own)
+
+    def mischief(bench: SimulatedBench, control: Control) -> None:
+        armed.append(settings(bench))
+        if asked == "stop":
+            control.ask("a test")
+        else:
+            bench.inject(Fault(role="hv", kind="interlock", at_s=bench.now))
+
+    story = tell(mischief)
+    percent, kill, current, *bounds_and_trip = armed[0]
+    assert percent == pytest.approx(5.0) and kill and current == pytest.approx(5e-5)  # 300 V/s of 6 kV; the scene's
+    assert bounds_and_trip == pytest.approx([90.0, 5e-5, 20, OFF_AT_ONCE])
+    assert story.outcome.safe and abs(story.final_output) < 60
+    assert settings(story.bench) == pytest.approx((10.0, False, 1e-3, 0.0, 0.0, 0, DISABLED))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, label
@@ -19,7 +19,6 @@ from drivers.instruments.iseg_edcp.codec import (
     Item,
     LogOn,
     Message,
-    ModuleControl,
     ModuleStatus,
     Value,
     hv_flags,
@@ -45,6 +44,7 @@ from drivers.instruments.iseg_edcp.exchange import (
     names_of,
     value_of,
 )
+from drivers.instruments.iseg_edcp.protection import Protection
 from drivers.links.link import CanFrame, DeviceError, DeviceRefused, DeviceSilent, FrameLink
 from drivers.roles import HVSample, Identity
 
@@ -127,6 +127,7 @@ class IsegEDCP:
             advice=f"Check power, CAN cable and termination, bit rate, and that module {module} is its address.",
             heard=self._heard,
         )
+        self._protection = Protection(module, channel)
         self._exchange: Exchange | None = None
         self._collected: dict[int, Message] = {}
         self._nominal = (math.nan, math.nan)
@@ -221,33 +222,29 @@ class IsegEDCP:
     def close(self) -> None:
         self._link.close()
 
-    # -- beyond the role --------------------------------------------------------------------------------------------
+    # -- its own trip, and giving back what arming changed -------------------------------------------------------------
 
-    def set_kill(self, enabled: bool) -> None:
-        """Kill enabled: a channel that exceeds its limits is shut off for good; else it is cut and ramps up again."""
-        self._command(self._write_kill(enabled))
+    @property
+    def found(self) -> Mapping[str, float]:
+        """What arming changes, as it was found."""
+        return self._protection.found
 
-    def set_trip(self, delay_s: float, action: int) -> None:
-        """What the module does after the current has been at its limit for ``delay_s``: see `TRIP_ACTIONS`."""
-        if not 0.0 <= delay_s <= 4.095:
-            raise DeviceRefused(self._label, f"a trip delay of {delay_s:g} s is not possible", "Allowed: 0 to 4.095 s.")
-        if action not in edcp.TRIP_ACTIONS:
-            allowed = ", ".join(f"{code} {text}" for code, text in edcp.TRIP_ACTIONS.items())
-            raise DeviceRefused(self._label, f"trip action {action} does not exist", f"Allowed: {allowed}.")
-        self._command(self._write_setting(edcp.TRIP_DELAY, round(delay_s * 1000), self._channel, "trip_delay_ms"))
-        self._command(self._write_setting(edcp.TRIP_ACTION, action, self._channel, "trip_action"))
+    @property
+    def given_back(self) -> bool:
+        return self._protection.given_back
 
-    def set_bounds(self, volts: float, amperes: float) -> None:
-        """Deviation of voltage and current from their set-points beyond which the channel reports a bounds error."""
-        self._require_ready("set bounds")
-        if not (0.0 <= volts <= self._nominal[0] and 0.0 <= amperes <= self._nominal[1]):
-            raise DeviceRefused(
-                self._label,
-                f"bounds of {volts:g} V and {amperes:g} A are outside the channel's range",
-                f"Allowed: 0 to {self._nominal[0]:g} V and 0 to {self._nominal[1]:g} A.",
-            )
-        self._command(self._write_setting(edcp.VOLTAGE_BOUNDS, volts, self._channel, "voltage_bounds_V"))
-        self._command(self._write_setting(edcp.CURRENT_BOUNDS, amperes, self._channel, "current_bounds_A"))
+    def arm_trip(self, volts: float, amperes: float) -> None:
+        """Let the channel report a voltage ``volts`` away from its set-point, and trip above ``amperes``."""
+        self._require_ready("arm its trip")
+        self._command(self._arm_trip(volts, amperes))
+
+    def resume_found(self, found: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        self._protection.resume(found)
+        return {key: (math.nan, value) for key, value in self.found.items()}
+
+    def give_back(self) -> None:
+        if self._ready and not self.given_back:
+            self._command(self._giving_back())
 
     # -- polling ----------------------------------------------------------------------------------------------------
 
@@ -502,7 +499,9 @@ class IsegEDCP:
         )
 
     def _write_setting(self, item: Item, value: float, channel: int | None, key: str) -> Script[None]:
+        before = float(self.settings[key])
         yield from self._write_checked(item, value, channel)
+        self._protection.changed(key, before, value)
         self.settings[key] = f"{value:.9g}"
 
     def _write_ramp(self, percent: float) -> Script[None]:
@@ -510,11 +509,15 @@ class IsegEDCP:
         self.settings["ramp_V_per_s"] = f"{percent / 100 * self._nominal[0]:.9g}"
         self._wanted_ramp = None
 
-    def _write_kill(self, enabled: bool) -> Script[None]:
-        control = ModuleControl((yield from self._integer(edcp.MODULE_CONTROL)))
-        control = control | ModuleControl.KILL if enabled else control & ~ModuleControl.KILL
-        yield from self._write_checked(edcp.MODULE_CONTROL, int(control), None)
-        self.settings["kill_enabled"] = "yes" if enabled else "no"
+    def _arm_trip(self, volts: float, amperes: float) -> Script[None]:
+        self.settings |= yield from self._protection.arm(volts, amperes, alone=self._channels == 1)
+
+    def _giving_back(self) -> Script[None]:
+        refused = yield from self._protection.give_back()
+        if refused:
+            raise DeviceRefused(
+                self._label, f"does not take {', '.join(refused)} back as found", "Set them in the maker's software."
+            )
 
     def _switch_on(self) -> Script[None]:
         status = ChannelStatus((yield from self._integer(edcp.CHANNEL_STATUS)))

@@ -214,11 +214,11 @@ class ZaberStage:
         """Whether every setting is as it was found, by the device's own word."""
         return self._present == self.found
 
-    def resume_found(self, found: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+    def resume_found(self, found: Mapping[str, float]) -> dict[str, tuple[int, int]]:
         """Take over what an earlier run found; a knob that is enabled again shows that it was put right since."""
         if found.get("knob.enable") == 1 and self._present.get("knob.enable") == 1:
             return {}
-        left = {key: (self._present[key], value) for key, value in found.items() if key in self._present}
+        left = {key: (self._present[key], int(value)) for key, value in found.items() if key in self._present}
         left = {key: (now, before) for key, (now, before) in left.items() if now != before and before >= 0}
         self.found.update({key: before for key, (_, before) in left.items()})
         return left

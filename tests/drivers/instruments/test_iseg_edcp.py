@@ -722,26 +722,62 @@ def test_the_other_channels_of_the_module_are_watched() -> None:
     assert frame("201# 60 00 00 07 00") in rig.module.sent
 
 
-def test_kill_trip_and_bounds() -> None:
+def found_again(module: Module) -> dict[bytes, bytes]:
+    return {key: value for key, value in module.values.items() if key[0] in (0x10, 0x11, 0x40, 0x41)}
+
+
+def test_arming_its_own_trip_and_giving_everything_back() -> None:
     rig = Rig().until_ready()
-    rig.hv.set_kill(True)
-    rig.hv.set_trip(0.1, 2)
-    rig.hv.set_bounds(50.0, 1e-4)
+    rig.module.set(edcp.MODULE_CONTROL, 0x1001)  # somebody's own bits
+    rig.module.set(edcp.TRIP_DELAY, 100)
+    at_first = found_again(rig.module)
+    rig.hv.set_ramp(300.0)
+    rig.hv.set_current_limit(5e-5)
+    rig.hv.arm_trip(50.0, 5e-5)
     rig.settle()
-    assert rig.writes == [
-        frame("200# 10 01 40 00"),
-        frame("200# 40 05 00 00 64"),
-        frame("200# 40 06 00 02"),
+    assert rig.writes[2:] == [
         edcp.write(0, edcp.VOLTAGE_BOUNDS, 50.0, 0),
-        edcp.write(0, edcp.CURRENT_BOUNDS, 1e-4, 0),
+        edcp.write(0, edcp.CURRENT_BOUNDS, 5e-5, 0),
+        frame("200# 40 05 00 00 14"),
+        frame("200# 40 06 00 02"),
+        frame("200# 10 01 50 01"),
     ]
-    assert rig.hv.settings["kill_enabled"] == "yes"
-    with pytest.raises(DeviceRefused, match="2 off without ramp"):
-        rig.hv.set_trip(0.1, 9)
-    with pytest.raises(DeviceRefused, match=r"0 to 4\.095 s"):
-        rig.hv.set_trip(5.0, 2)
-    with pytest.raises(DeviceRefused, match="Allowed: 0 to 6000 V"):
-        rig.hv.set_bounds(float("nan"), 0.0)
+    assert rig.hv.settings["kill"] == "1" and rig.hv.settings["trip_action"] == "2"
+    assert not rig.hv.given_back
+    rig.hv.give_back()
+    rig.settle()
+    assert rig.hv.given_back and found_again(rig.module) == at_first
+
+
+def test_kill_is_left_alone_on_a_module_whose_other_channels_are_somebody_elses() -> None:
+    rig = Rig(Module(channels=2)).until_ready()
+    rig.hv.arm_trip(50.0, 5e-5)
+    rig.settle()
+    assert rig.module.get(edcp.MODULE_CONTROL) == 0 and rig.module.get(edcp.TRIP_ACTION) == 2
+    assert rig.module.get(edcp.TRIP_ACTION, 1) == 0 and "kill" not in rig.hv.found
+
+
+def test_a_module_without_a_trip_of_its_own_is_armed_without_it() -> None:
+    module = Module()
+    for key in (b"\x40\x05\0", b"\x40\x06\0", b"\x10\x01"):
+        del module.values[key]
+    rig = Rig(module).until_ready()
+    rig.hv.arm_trip(50.0, 5e-5)
+    rig.settle()
+    assert rig.hv.settings["kill"] == rig.hv.settings["trip_action"] == "the module does not have it"
+    rig.hv.give_back()
+    rig.settle()
+    assert rig.hv.given_back and module.get(edcp.VOLTAGE_BOUNDS) == 0.0
+
+
+def test_what_another_program_had_found_is_given_back() -> None:
+    rig = Rig().until_ready()
+    rig.hv.resume_found({"current_limit_A": 2e-4, "kill": 0.0, "no such thing": 1.0})
+    rig.module.set(edcp.MODULE_CONTROL, 0x4001)
+    rig.hv.give_back()
+    rig.settle()
+    assert rig.hv.given_back and rig.module.get(edcp.SET_CURRENT) == pytest.approx(2e-4)
+    assert rig.module.get(edcp.MODULE_CONTROL) == 0x0001
 
 
 def test_closing_sends_nothing() -> None:
