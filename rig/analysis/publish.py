@@ -24,6 +24,7 @@ from rig.base.errors import ConfigError, DataError
 from rig.base.json_text import parse_json
 from rig.base.outputs import write_text
 from rig.base.text_file import read_text
+from rig.base.toml_write import toml_of
 from rig.importing.options import SUFFIX
 from rig.log.notes import notes_file
 
@@ -197,15 +198,6 @@ def _copy(recipe: Recipe, found: Sequence[Path], part: Path) -> list[str]:
             write_text(part / f"{place}{SUFFIX}", toml_of(one.options))
         places.append(place)
     return places
-
-
-def toml_of(table: Mapping[str, Any]) -> str:
-    """A table of plain values and of tables of plain values as TOML."""
-    plain = [f"{key} = {json.dumps(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            plain += [f"[{key}]", *(f"{json.dumps(name)} = {json.dumps(one)}" for name, one in value.items())]
-    return "\n".join(plain) + "\n"
 
 
 def _title(recipe: Recipe, about: About) -> str:

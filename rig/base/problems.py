@@ -27,6 +27,7 @@ SIGNS = {
     "protocol": {"step"},
     "certificate": {"valid_from", "valid_until"},
     "study": {"study"},
+    "campaign": {"specimen", "logs", "order"},
 }
 
 

@@ -17,6 +17,7 @@ from rig.base.errors import ConfigError
 from rig.base.law_tables import law_table
 from rig.base.problems import options, shown
 from rig.base.reference import tables_in
+from rig.campaign.campaign import CampaignTable
 from rig.design.study import KINDS as STUDIES
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import Scene
@@ -62,6 +63,7 @@ FILES = {
     "protocol": File([("protocol file", Protocol)], Protocol),
     "certificate": _kinds("certificate file", "role", CERTIFICATES),
     "simulation": File([("[simulation]", SimulationSettings)], SimulationSettings),
+    "campaign": File([("campaign file", CampaignTable)], CampaignTable),
     "study": _kinds("study file", "study", STUDIES),
 }
 
