@@ -7,6 +7,7 @@ import io
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rig.base.text import printable
 from rig.campaign.campaign import Campaign
 from rig.campaign.progress import COMPLETE, Done, progress_of
 from rig.log.reader import read_log
@@ -51,8 +52,6 @@ def rows_of(campaign: Campaign) -> list[Row]:
 def as_table(campaign: Campaign, rows: list[Row]) -> Table:
     """The rows for the terminal."""
     from rich.table import Table
-
-    from rig.base.text import printable
 
     table = Table(title=printable(campaign.table.title) or None)
     for heading in ("specimen", "batch", "is", "date (UTC)", "found", "voltage / V", "field / V/um", "fit"):
