@@ -3,12 +3,35 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
-from rig.analysis.sensors import ROLE, UNIT, Calibration
+from rig.analysis.sensors import ROLE, UNIT, Calibration, Quantity
 
 VALID_DAYS = 365
+_TABLE, _CERTIFICATE = re.compile(r"\s*\[([^\[\]]+)\]"), re.compile(r"\s*certificate\s*=")
+
+
+def certificate_place(scene: Path | None, quantity: Quantity, certificate: Path | None = None) -> str:
+    """Which line of which scene names the certificate of a quantity, and what belongs there; for people."""
+    role = ROLE[quantity]
+    if scene is None:
+        return f'For the scene: [{role}], certificate = "{certificate}", as seen from the scene.'
+    table, number, now = "", 0, ""
+    for at, line in enumerate(scene.read_text(encoding="utf-8").splitlines(), 1):
+        if heading := _TABLE.match(line):
+            table = heading[1].strip()
+        elif table == role and _CERTIFICATE.match(line):
+            number, now = at, line.split("=", 1)[1].strip()
+    if certificate is None:
+        return f"and name the new one in {scene}, line {number}, [{role}] (now {now})."
+    new = f"certificate = {json.dumps(os.path.relpath(certificate, scene.parent), ensure_ascii=False)}"
+    if not number:
+        return f"For the scene {scene}: add to [{role}]: {new}"
+    return f"For the scene {scene}, line {number}, [{role}]: {new}  (now {now})"
 
 
 def certificate_text(calibration: Calibration, valid_days: int = VALID_DAYS) -> str:

@@ -24,6 +24,7 @@ HELPERS = {  # modules of this package that are no commands
     "import_options",
     "running",
     "show",
+    "swapped",
     "talk",
     "topics",
 }

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from rig.cli.files import FILE, FOLDER, nothing_without_a_log, tell_written
+from rig.cli.files import FILE, FOLDER, PORTS, nothing_without_a_log, read_ports, tell_written
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -24,16 +24,24 @@ if TYPE_CHECKING:
 @click.option("--protocol", type=FILE, help="Steps to run in place of the usual ones.")
 @click.option("--valid-days", type=click.IntRange(1, 3650), default=365, show_default=True, help="Of the certificate.")
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports (hv only).")
+@PORTS
 @click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
 def command(
-    quantity: Quantity, source: Path, out: Path, protocol: Path | None, valid_days: int, arm: bool, yes: bool
+    quantity: Quantity,
+    source: Path,
+    out: Path,
+    protocol: Path | None,
+    valid_days: int,
+    arm: bool,
+    ports: Path | None,
+    yes: bool,
 ) -> None:
     """Calibrate an instrument on the bench of SOURCE, a scene, and write its certificate; or from SOURCE, a log.
 
     force: weights. displacement: the laser against the stage. compliance: the rig, against a rigid dummy. hv: the
     monitor against a reference meter. timing: how far laser and force lag behind the stage.
     """
-    from rig.analysis.certificate_file import certificate_text
+    from rig.analysis.certificate_file import certificate_place, certificate_text
     from rig.analysis.sensor_picture import draw
     from rig.analysis.sensors import calibrate
     from rig.base.errors import ConfigError
@@ -45,20 +53,32 @@ def command(
     if source.suffix == ".mcap":
         if protocol is not None:
             raise ConfigError("--protocol goes with a scene; a log holds its own.")
+        if ports is not None:
+            raise ConfigError("--ports goes with a scene; a log needs no instruments.")
         with _made(out, *wanted):
             found = calibrate(source, quantity)
     else:
-        log = _run(quantity, source, out, protocol, wanted, arm=arm, yes=yes)
+        log = _run(quantity, source, out, protocol, wanted, read_ports(ports), arm=arm, yes=yes)
         found = calibrate(log, quantity)
     if quantity != "timing":
         write_text(certificate, certificate_text(found, valid_days))
     draw(found, picture)
     show(*calibration_table(found))
     tell_written(*wanted)
+    if quantity != "timing":
+        click.echo(certificate_place(source if source.suffix != ".mcap" else None, quantity, certificate))
 
 
 def _run(
-    quantity: Quantity, scene: Path, out: Path, protocol: Path | None, wanted: list[Path], *, arm: bool, yes: bool
+    quantity: Quantity,
+    scene: Path,
+    out: Path,
+    protocol: Path | None,
+    wanted: list[Path],
+    ports: dict[str, Any] | None,
+    *,
+    arm: bool,
+    yes: bool,
 ) -> Path:
     """Carry the calibration out on the bench of ``scene``; its log. The usual steps are left beside it."""
     from rig.analysis.sensor_protocols import protocol_text
@@ -75,7 +95,7 @@ def _run(
         if protocol is None:
             write_text(steps, text)
         with nothing_without_a_log(log, *made):
-            run_and_tell(prepare(scene, steps), log, arm=arm, yes=yes, take_down=False)
+            run_and_tell(prepare(scene, steps, ports), log, arm=arm, yes=yes, take_down=False)
     return log
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,8 @@ import click
 
 from rig.cli.files import FILE
 
-MOST_ROWS = 200  # of the table; of a longer plan the beginning and the end are shown
+MOST_ROWS = 200  # of a longer plan the beginning and the end are shown
+PAGE = 40  # rows where there is no terminal, whose height is a page
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,49 +24,78 @@ if TYPE_CHECKING:
 @click.argument("protocol", type=FILE)
 def command(scene: Path, protocol: Path) -> None:
     """Validate SCENE and PROTOCOL and print the plan with what the model predicts. Touches no hardware."""
+    import shutil
+    import sys
+
+    from rich.text import Text
+
     from rig.cli.show import show
     from rig.protocol.experiment import prepare
     from rig.run.rehearse import check_instruments
 
     experiment = prepare(scene, protocol)
     check_instruments(experiment)
-    show(plan_table(experiment))
+    page = max(shutil.get_terminal_size().lines - 8, 10) if sys.stdout.isatty() else PAGE
+    show(*pages(experiment, page), Text(summary(experiment)))
 
 
-def plan_table(experiment: Experiment) -> Table:
-    """The plan: every action with its time and the extremes that the model predicts of it."""
+def pages(experiment: Experiment, page: int) -> list[Table]:
+    """The plan: every action with its time and the extremes that the model predicts of it; each page has the heads."""
+    from rich import box
     from rich.table import Table
 
-    from rig.cli.show import minutes
+    title = f"{experiment.protocol.title or 'Protocol'} on {experiment.scene.specimen.name}"
+    heads = ["step", "action", "time\n/ s", "peak\nforce / N"]
+    if experiment.scene.hv is not None:
+        heads += ["peak field\n/ V/um", "tension\nmargin / kPa"]
+    rows = list(_rows(experiment))
+    tables = []
+    for first in range(0, max(len(rows), 1), page):
+        number = f" (page {first // page + 1} of {-(-len(rows) // page)})" if len(rows) > page else ""
+        table = Table(title=title + number, box=box.SIMPLE_HEAD)
+        for head in heads:
+            table.add_column(head, justify="left" if head == "action" else "right", no_wrap=head != "action")
+        for row in rows[first : first + page]:
+            table.add_row(*row)
+        tables.append(table)
+    return tables
 
-    scene = experiment.scene
-    table = Table(
-        title=f"{experiment.protocol.title or 'Protocol'} on {scene.specimen.name}",
-        caption=(
-            f"{len(experiment.actions)} actions, {minutes(experiment.duration)}. Predicted with the scene's material; "
-            f"limits: force {scene.limits.force_N:g} N, displacement {scene.limits.displacement_mm:g} mm"
-            + (f", voltage {scene.limits.voltage_V:g} V" if scene.hv is not None else "")
-            + ". All hold."
-        ),
-    )
-    table.add_column("step", justify="right")
-    table.add_column("action")
-    table.add_column("time / s", justify="right")
-    table.add_column("peak force / N", justify="right")
-    if scene.hv is not None:
-        table.add_column("peak field / V/um", justify="right")
-        table.add_column("tension margin / kPa", justify="right")
+
+def _rows(experiment: Experiment) -> Iterator[list[str]]:
     left_out = len(experiment.actions) - MOST_ROWS
     for number, (action, prediction) in enumerate(zip(experiment.actions, experiment.predictions, strict=True)):
         if left_out > 0 and MOST_ROWS // 2 <= number < MOST_ROWS // 2 + left_out:
             if number == MOST_ROWS // 2:
-                table.add_row("...", f"{left_out} more, which hold too", "...")
+                yield ["...", f"{left_out} more, which hold too", "..."]
             continue
         row = [str(action.step), f"{action.kind}: {action.label}", f"{action.duration:.1f}"]
         if action.record or action.moves or action.voltage[0] != action.voltage[1]:
             row.append(f"{prediction.peak_force:.3f}")
-            if scene.hv is not None:
+            if experiment.scene.hv is not None:
                 row.append(f"{prediction.peak_field * 1e-6:.1f}")
                 row.append(f"{prediction.minimum_hoop_stress * 1e-3:.0f}")
-        table.add_row(*row)
-    return table
+        yield row
+
+
+def summary(experiment: Experiment) -> str:
+    """How long it takes, and how near it comes to the limits."""
+    import math
+
+    from rig.cli.show import minutes
+    from rig.safety.limits import Limits
+
+    limits, predictions = Limits.of(experiment.scene), experiment.predictions
+    reached = [
+        (limits.force, max((one.peak_force for one in predictions), default=0.0)),
+        (limits.displacement, max((end for action in experiment.actions for end in action.h), default=0.0)),
+    ]
+    if experiment.scene.hv is not None:
+        reached.append((limits.voltage, experiment.highest_voltage))
+        reached.append((limits.field, max((one.peak_field for one in predictions), default=0.0)))
+    steps = max((action.step for action in experiment.actions), default=0)
+    head = f"{len(experiment.actions)} actions in {steps} steps, {minutes(experiment.duration)} at most."
+    lines = [f"{head} Highest, with the scene's material:"]
+    for limit, value in reached:
+        allowed = f"of {limit.high * limit.per_si:g} allowed" if math.isfinite(limit.high) else "no limit"
+        lines.append(f"  {limit.name:<13}{value * limit.per_si:.4g} {limit.unit}, {allowed}")
+    return "\n".join([*lines, "All hold."])

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,11 @@ FILE_OR_STDIN = click.Path(path_type=Path, dir_okay=False, allow_dash=True)
 FOLDER = click.Path(path_type=Path, file_okay=False)
 
 
+PORTS = click.option(
+    "--ports", type=FILE_OR_STDIN, help="Ports by role as `dea-rig sim` prints them, in place of the scene's."
+)
+
+
 def read_ports(path: Path | None) -> dict[str, dict[str, Any]] | None:
     """The ports by role that `dea-rig sim` printed; None for no file."""
     from rig.base.errors import ConfigError
@@ -53,6 +59,11 @@ def read_ports(path: Path | None) -> dict[str, dict[str, Any]] | None:
     ports = read_json(path, "ports")
     if not isinstance(ports, dict) or not all(isinstance(value, dict) for value in ports.values()):
         raise ConfigError(f"{path}: not the JSON that `dea-rig sim` prints: a table of ports by role is needed.")
+    known = ("stage", "force", "displacement", "hv")
+    if unknown := sorted(ports.keys() - {*known, "served_by"}):
+        near = get_close_matches(unknown[0], known, n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise ConfigError(f"{path}: {unknown[0]!r} is no role; roles are {', '.join(known)}.{hint}")
     return ports
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from rig.cli.files import FILE, FILE_OR_STDIN, POSITIVE, read_ports
+from rig.cli.files import FILE, PORTS, POSITIVE, read_ports
 
 NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.5 is a way, not an option
 
@@ -15,7 +15,7 @@ NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.5 is a way, not an opt
 @click.command("jog", context_settings=NEGATIVE_NUMBERS)
 @click.argument("scene", type=FILE)
 @click.argument("moves", nargs=-1)
-@click.option("--ports", type=FILE_OR_STDIN, help="Ports by role as `dea-rig sim` prints them.")
+@PORTS
 @click.option("--step-mm", type=POSITIVE, default=0.1, show_default=True, help="How far + and - go.")
 @click.option("--speed-mm-per-s", type=POSITIVE, default=1.0, show_default=True, help="Of the stage.")
 @click.option("-o", "--out", type=FILE, help="Log to write; default: jog-DATE-TIME.mcap here.")

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from rig.cli.files import FILE, FILE_OR_STDIN, read_ports
+from rig.cli.files import FILE, PORTS, read_ports
 
 
 @click.command("read")
 @click.argument("scene", type=FILE)
-@click.option("--ports", type=FILE_OR_STDIN, help="Ports by role as `dea-rig sim` prints them.")
+@PORTS
 @click.option("-o", "--out", type=FILE, help="Keep the log of it; default: it is not kept.")
 def command(scene: Path, ports: Path | None, out: Path | None) -> None:
     """One line for each instrument of SCENE: what it says now, and who it is. Nothing is moved or switched.

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import click
 
-from rig.cli.files import FILE, read_ports
+from rig.cli.files import FILE, PORTS, read_ports
 
 
 @click.command("resume")
 @click.argument("log", type=FILE)
 @click.option("-o", "--out", type=FILE, required=True, help="Log to write; never overwrites.")
-@click.option("--ports", type=FILE, help="Ports by role, as for `dea-rig run`.")
+@PORTS
 @click.option("--arm", is_flag=True, help="As for `dea-rig run`.")
 @click.option("--yes", is_flag=True, help="As for `dea-rig run`.")
 @click.option("--take-down", is_flag=True, help="As for `dea-rig run`.")

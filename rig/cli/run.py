@@ -6,16 +6,14 @@ from pathlib import Path
 
 import click
 
-from rig.cli.files import FILE, FILE_OR_STDIN, read_ports
+from rig.cli.files import FILE, PORTS, read_ports
 
 
 @click.command("run")
 @click.argument("scene", type=FILE)
 @click.argument("protocol", type=FILE)
 @click.option("-o", "--out", type=FILE, required=True, help="Log to write; never overwrites.")
-@click.option(
-    "--ports", type=FILE_OR_STDIN, help="Ports by role as `dea-rig sim` prints them, in place of the scene's."
-)
+@PORTS
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports; the highest voltage is asked for too.")
 @click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
 @click.option("--take-down", is_flag=True, help="Ramp down an output that is found live; default: ask.")

@@ -8,10 +8,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from rig.base.errors import ConfigError
+from drivers.links.link import DeviceError
+from rig.base.errors import ConfigError, FaultError, RigError
 from rig.base.terminal import tell
+from rig.cli.swapped import others_on_its_ports
 from rig.log.contents import bench_word
 from rig.operator.display import Display
+from rig.operator.notice import tell_end
+from rig.operator.status import Status
 from rig.protocol.experiment import Experiment, prepare
 from rig.run.run import Consent
 from rig.run.run import run as run_experiment
@@ -46,8 +50,29 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
             "--yes on the command line" if yes else "",
             "--take-down on the command line" if take_down else "",
         )
-    with Display(f"{word}: {kind}. {scene.specimen.name}: {experiment.protocol.title}", word) as display:
-        outcome = run_experiment(
-            experiment, out, lambda done, total, label: None, consent, display.say, show=display.show
-        )
-    tell(f"{word}: {out}: {outcome.reason} after {outcome.duration:.0f} s; {outcome.state}.", "stdout")
+    begun = False
+
+    def show(status: Status) -> None:
+        nonlocal begun
+        begun = True
+        display.show(status)
+
+    try:
+        with Display(f"{word}: {kind}. {scene.specimen.name}: {experiment.protocol.title}", word) as display:
+            outcome = run_experiment(experiment, out, lambda done, total, label: None, consent, display.say, show=show)
+    except (RigError, DeviceError) as error:
+        if not begun and scene.on_real_ports and isinstance(error, FaultError | DeviceError):
+            for line in others_on_its_ports(scene):
+                error.add_note(line)
+        _tell_elsewhere(experiment, out, getattr(error, "exit_code", 4), f"{word}: {out}: {error}")
+        raise
+    said = f"{word}: {out}: {outcome.reason} after {outcome.duration:.0f} s; {outcome.state}."
+    tell(said, "stdout")
+    _tell_elsewhere(experiment, out, 0, said)
+
+
+def _tell_elsewhere(experiment: Experiment, out: Path, exit_code: int, text: str) -> None:
+    """By the scene's ``on_end``: of a run that goes on with a log it is that log's, which others may have written."""
+    command = experiment.scene.on_end if experiment.resumed is None else []
+    if problem := tell_end(command, str(out.resolve()), exit_code, text):
+        tell(f"on_end: {problem}.", colour="red")

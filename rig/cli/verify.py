@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rig.cli.files import FILE, POSITIVE, nothing_without_a_log
+from rig.cli.files import FILE, PORTS, POSITIVE, nothing_without_a_log, read_ports
 
 if TYPE_CHECKING:
     from rig.analysis.sensors import Quantity
@@ -19,9 +19,13 @@ if TYPE_CHECKING:
 @click.option("--standard", type=POSITIVE, required=True, help="In g, mm or V.")
 @click.option("-o", "--out", type=FILE, required=True, help="Log to write; never overwrites.")
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports (hv only).")
+@PORTS
 @click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
-def command(quantity: Quantity, scene: Path, standard: float, out: Path, arm: bool, yes: bool) -> None:
+def command(
+    quantity: Quantity, scene: Path, standard: float, out: Path, arm: bool, ports: Path | None, yes: bool
+) -> None:
     """Daily one-point check: does the sensor still agree with its certificate? Exit code 1 if not."""
+    from rig.analysis.certificate_file import certificate_place
     from rig.analysis.one_point import judge
     from rig.analysis.sensor_protocols import verify_text
     from rig.base.outputs import check_new, write_text
@@ -30,11 +34,12 @@ def command(quantity: Quantity, scene: Path, standard: float, out: Path, arm: bo
     from rig.scene.scene import load_scene
 
     loaded, _ = load_scene(scene)
+    given = read_ports(ports)
     steps = out.with_suffix(".protocol.toml")
     check_new(out, steps)
     write_text(steps, verify_text(quantity, loaded, standard))
     with nothing_without_a_log(out, steps):
-        run_and_tell(prepare(scene, steps), out, arm=arm, yes=yes, take_down=False)
+        run_and_tell(prepare(scene, steps, given), out, arm=arm, yes=yes, take_down=False)
     found = judge(out, quantity)
     factor, unit = (1e3, "mm") if found.unit == "m" else (1.0, found.unit)
     click.echo(
@@ -43,4 +48,5 @@ def command(quantity: Quantity, scene: Path, standard: float, out: Path, arm: bo
         + ("the certificate holds." if found.passed else "DOES NOT AGREE. Calibrate anew before you measure.")
     )
     if not found.passed:
+        click.echo(f"Then: dea-rig calibrate {quantity} {scene} -o FOLDER\n{certificate_place(scene, quantity)}")
         click.get_current_context().exit(1)

@@ -317,6 +317,8 @@ class Engine:
         """Whether the action came to its end; False when the operator wants a pause."""
         began = self._began = self.clock.now()
         self._doing_now = action
+        asked = [other.asks for other in self._actions]
+        self.rig.question_number = f"{sum(asked[: self._number + 1])} of {sum(asked)}" if action.asks else ""
         write_phase(
             self.rig,
             action,
@@ -386,7 +388,7 @@ class Engine:
         if self.clock.now() >= self._next_progress:
             self._next_progress = self.clock.now() + 0.2
             question = self.control.question
-            label = f"waiting for you: {question.text}" if question is not None else label
+            label = f"waiting for you: {question.shown}" if question is not None else label
             self._show_numbers(label)
             self._show(done, total, label)
 

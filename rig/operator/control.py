@@ -27,11 +27,18 @@ class Question:
     """What the operator is asked.
 
     ``expected`` is what has to be typed, letter by letter; empty: anything will do. ``hint`` says what may be typed.
+    ``number`` says which of how many it is ("3 of 34").
     """
 
     text: str
     expected: str = ""
     hint: str = ""
+    number: str = ""
+
+    @property
+    def shown(self) -> str:
+        """The text with its number in front."""
+        return f"{self.number}: {self.text}" if self.number else self.text
 
 
 @dataclass(frozen=True)
@@ -118,7 +125,7 @@ class Control(StopRequest):
         wanted = question.hint or (
             f"type {question.expected}" if question.expected else "press Enter, or type a remark for the log"
         )
-        self.say(f"{question.text}\n  -> {wanted}; or s to stop. From another terminal: dea-rig continue")
+        self.say(f"{question.shown}\n  -> {wanted}; or s to stop. From another terminal: dea-rig continue")
 
     def withdraw(self) -> None:
         """The question is no longer asked."""
@@ -167,7 +174,7 @@ class Control(StopRequest):
         return {
             "state": state,
             "doing": self.doing,
-            "question": question.text if question is not None else "",
+            "question": question.shown if question is not None else "",
             "expected": question.expected if question is not None else "",
         }
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -126,6 +126,13 @@ class Scene(Table):
         default_factory=list,
         max_length=50,
         description='Keys whose unusual values are meant, by name: ["limits.force_N"].',
+    )
+    on_end: list[Annotated[str, Field(max_length=1000)]] = Field(
+        default_factory=list,
+        max_length=50,
+        description='Program that is started when a run ends, with its arguments: ["mail-me", "lab@example.org"]. No '
+        "shell; nobody waits for it. Its environment has DEA_RIG_LOG, DEA_RIG_EXIT_CODE and DEA_RIG_TEXT. Default: "
+        "none.",
     )
     specimen: SpecimenTable = Field(description="The film as mounted.")
     limits: LimitsTable = Field(description="What may never be exceeded.")

@@ -165,6 +165,11 @@ class Action(ABC):
             object.__setattr__(self, "kind", self.by.kind)
 
     @property
+    def asks(self) -> bool:
+        """Whether the operator is asked something by it, once."""
+        return False
+
+    @property
     def moves(self) -> bool:
         """Whether the stage moves along the film's axis, from one known displacement to another."""
         return self.speed > 0 and self.h[0] != self.h[1]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Generator, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -74,6 +76,10 @@ class Metering(Standstill):
 
     relative_error: float
 
+    @property
+    def asks(self) -> bool:
+        return self.way != 0
+
     def carry_out(self, rig: Rig) -> Turns:
         yield from ramp_to(rig, self.voltage[1], self.allowed_s)
         yield from pause(rig, self.settle)
@@ -81,15 +87,22 @@ class Metering(Standstill):
             return
         self.begin(rig)
         yield from pause(rig, self.average)
-        answer = yield from rig.ask(
-            Question(f"Read the reference meter (about {self.voltage[1]:g} V) and type its voltage in V."),
-            lambda hands: hands.read_meter(self.relative_error, self.applied_error, rig.clock.now()),
-        )
-        try:
-            volts = float(answer.text.replace(",", "."))
-        except ValueError:
-            raise FaultError(
-                f"The reference meter's voltage was to be typed in V; {answer.text!r} is not a number."
-            ) from None
+        volts = yield from self._read(rig)
         rig.recorder.reference("applied", volts, self.applied_error, "V")
         self.end(rig)
+
+    def _read(self, rig: Rig) -> Generator[None, None, float]:
+        """What the operator reads on the meter (V); asked again until it is a number."""
+        text = f"Read the reference meter (about {self.voltage[1]:g} V) and type its voltage in V."
+        while True:
+            answer = yield from rig.ask(
+                Question(text, hint="type its voltage"),
+                lambda hands: hands.read_meter(self.relative_error, self.applied_error, rig.clock.now()),
+            )
+            with suppress(ValueError):
+                volts = float(answer.text.strip().removesuffix("V").replace(",", "."))
+                if math.isfinite(volts):
+                    return volts
+            if rig.control.unattended:
+                raise FaultError(f"The meter's voltage was to be typed in V; {answer.text!r} is not a number.")
+            rig.control.say(f"{answer.text!r} is not a number of volts.")

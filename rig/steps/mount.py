@@ -57,6 +57,10 @@ class Mounting(Action):
 
     fixture: Fixture
 
+    @property
+    def asks(self) -> bool:
+        return True
+
     def carry_out(self, rig: Rig) -> Turns:
         yield from take_down(rig, "the operator's hands come near")
         yield from rig.ask(Question(WORDS[self.fixture]), lambda hands: hands.mount(self.fixture, rig.clock.now()))

@@ -41,6 +41,10 @@ class Prompt(Step):
 class Asking(Action):
     """Whoever is asked may touch the rig, so the voltage is off and latched before."""
 
+    @property
+    def asks(self) -> bool:
+        return True
+
     def carry_out(self, rig: Rig) -> Turns:
         yield from take_down(rig, "the operator is asked")
         yield from rig.ask(Question(self.label))

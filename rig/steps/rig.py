@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
 
 from drivers.roles import Sample
 from rig.base.errors import FaultError
@@ -69,6 +70,7 @@ class Rig:
         self.take_down = take_down
         self.guard: AnyGuard | None = None
         self.force_noise = math.nan
+        self.question_number = ""  # which of the plan's questions is asked next ("3 of 34")
         self.listener: Callable[[Sample], None] | None = None
         self.on_readings: Callable[[str, Sequence[float]], None] = lambda role, readings: None
         self.hands: Hands | None = None if bench.simulated is None else bench.simulated.operator
@@ -142,6 +144,8 @@ class Rig:
         """
         self.recorder.operator("is asked", question.text, "")
         self.event("operator", f"asked: {question.text}")
+        if self.question_number and not question.expected:
+            question = replace(question, number=self.question_number)
         self.control.put(question)
         if by_hand is not None and self.hands is not None:
             done = by_hand(self.hands)

@@ -109,6 +109,10 @@ class Hanging(Standstill):
     applied: float
     creep: bool
 
+    @property
+    def asks(self) -> bool:
+        return True
+
     def carry_out(self, rig: Rig) -> Turns:
         yield from take_down(rig, "the operator's hands come near")
         text = f"Hang {self.label} on the force sensor." if self.applied else "Take all weights off the force sensor."

@@ -22,6 +22,16 @@ from rig.operator.signals import stop_on_signals
 posix = pytest.mark.skipif(os.name != "posix", reason="terminals and their signals are POSIX")
 
 
+def test_a_question_says_which_of_how_many_it_is_and_what_may_be_typed() -> None:
+    said: list[str] = []
+    control = Control(say=said.append)
+    control.put(Question("Hang 20 g.", number="3 of 34"))
+    assert said[0].startswith("3 of 34: Hang 20 g.\n  -> press Enter")
+    assert control.describe()["question"] == "3 of 34: Hang 20 g."
+    control.put(Question("Move the stage.", hint="+ or -"))
+    assert "-> + or -; or s to stop" in said[1]
+
+
 def test_a_line_is_a_command_or_the_answer_to_the_open_question() -> None:
     control = Control()
     assert "nothing to continue" in control.take("c", "me") and "p to pause" in control.take("hello", "me")
