@@ -30,7 +30,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from datetime import date
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -264,9 +264,28 @@ class ForceFile(AnyFile):
         )
 
 
-class DisplacementFile(AnyFile):
+class OneUnitFile(AnyFile):
+    """Certificate of a sensor that states what it measures; its keys carry the ``unit``."""
+
+    unit: ClassVar[str]
+
+    def certificate(self, name: str, raw: bytes) -> Certificate:
+        stems = (
+            "gain_{0}_per_{0}",
+            "gain_relative_uncertainty",
+            "noise_{0}",
+            "zero_uncertainty_{0}",
+            "range_{0}",
+            "role",
+        )
+        gain, relative, noise, zero, ends, role = (getattr(self, stem.format(self.unit)) for stem in stems)
+        return self._certificate(role, (gain, self.unit, relative), noise, zero, ends, name, raw)
+
+
+class DisplacementFile(OneUnitFile):
     """Certificate of a displacement sensor."""
 
+    unit: ClassVar[str] = "m"
     role: Literal["displacement"] = Field(description="Which role of a scene the certificate is for.")
     gain_m_per_m: Positive = Field(description="Displacement per metre that the sensor states. Typical: 0.99 to 1.01.")
     gain_relative_uncertainty: Relative = Field(description=GAIN_UNCERTAINTY)
@@ -274,24 +293,17 @@ class DisplacementFile(AnyFile):
     zero_uncertainty_m: NotNegative = Field(description="Standard uncertainty of a zero taken before the run (m).")
     range_m: Range = Field(description=f"{RANGE} In m.")
 
-    def certificate(self, name: str, raw: bytes) -> Certificate:
-        gain = self.gain_m_per_m, "m", self.gain_relative_uncertainty
-        return self._certificate("displacement", gain, self.noise_m, self.zero_uncertainty_m, self.range_m, name, raw)
 
-
-class HVFile(AnyFile):
+class HVFile(OneUnitFile):
     """Certificate of a supply's voltage monitor."""
 
+    unit: ClassVar[str] = "V"
     role: Literal["hv"] = Field(description="Which role of a scene the certificate is for.")
     gain_V_per_V: Positive = Field(description="Voltage per volt that the supply states. Typical: 0.99 to 1.01.")
     gain_relative_uncertainty: Relative = Field(description=GAIN_UNCERTAINTY)
     noise_V: NotNegative = Field(description="Standard deviation of one sample (V). Typical: 0.1 to 5.")
     zero_uncertainty_V: NotNegative = Field(description="Standard uncertainty of the reading at 0 V (V).")
     range_V: Range = Field(description=f"{RANGE} In V.")
-
-    def certificate(self, name: str, raw: bytes) -> Certificate:
-        gain = self.gain_V_per_V, "V", self.gain_relative_uncertainty
-        return self._certificate("hv", gain, self.noise_V, self.zero_uncertainty_V, self.range_V, name, raw)
 
 
 class StageFile(AnyFile):
