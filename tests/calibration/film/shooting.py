@@ -80,17 +80,14 @@ class Cone:
         force = 2.2 * math.pi * self.a * self.thickness / self.prestretch * s1 * np.sin(slope)
         unknown = np.stack((stretch, force))
         for _ in range(60):
-            there = self._shoot(unknown, field)
+            steps = np.stack((1e-7 * unknown[0], 1e-7 * np.abs(unknown[1]) + 1e-12))
+            nearby = [unknown, unknown + steps * [[1.0], [0.0]], unknown + steps * [[0.0], [1.0]]]
+            ends = self._shoot(np.concatenate(nearby, axis=1), np.tile(field, 3))
+            there, *moved = np.split(ends, 3, axis=1)
             miss = there - ring
             if np.abs(miss[0]).max() < 1e-10 and np.abs(miss[1]).max() < 1e-12:
                 return np.asarray(unknown[1])
-            steps = np.stack((1e-7 * unknown[0], 1e-7 * np.abs(unknown[1]) + 1e-12))
-            columns = []
-            for k in range(2):
-                moved = unknown.copy()
-                moved[k] += steps[k]
-                columns.append((self._shoot(moved, field) - there) / steps[k])
-            (a, c), (b, d) = columns
+            (a, c), (b, d) = ((one - there) / step for one, step in zip(moved, steps, strict=True))
             det = a * d - b * c
             lost = ~np.isfinite(det) | (det == 0.0)  # a meridian past the vertical: less force
             det[lost] = 1.0
