@@ -92,8 +92,8 @@ def identify_cones(
     found = identify_curves(table.curves, provenance, law=law_of, **options)
     notes = [str(one) for each in table.understood for one in each.findings if one.severity == "warning"]
     notes.append(
-        "noise is estimated from the scatter of the readings; gains (force and displacement 0.5 %, voltage 1 %), the "
-        "zero of force (1 % of the largest) and where the disk touches (20 um) are assumed, not stated"
+        "noise is estimated from the scatter of the readings; gain of the force (0.5 %), its zero (1 % of the "
+        "largest) and where the disk touches (20 um) are assumed; dimensions, displacement and voltage: see the budget"
     )
     return replace(found, notes=[*found.notes, *notes], scene_texts={str(scene): text})
 

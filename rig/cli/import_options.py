@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -98,13 +101,20 @@ def understood_or_refused(read: Callable[[], R]) -> R:
     try:
         found = read()
     except ImportRefused as refused:
-        for line in refused.understood:
-            click.echo(line)
+        _tell(refused.understood)
         raise
     for one in found.understood:
-        for line in one.lines():
-            click.echo(line)
+        _tell(one.lines())
     return found
+
+
+def _tell(lines: Sequence[str]) -> None:
+    """One fact a line; on a terminal wrapped between words, with what follows indented."""
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+    for line in lines:
+        margin = " " * (len(line) - len(line.lstrip()) + 4)
+        wrapped = textwrap.wrap(line, width, subsequent_indent=margin, break_on_hyphens=False) if width > 20 else [line]
+        click.echo("\n".join(wrapped))
 
 
 def with_import(result: dict[str, Any], understood: Sequence[Understood]) -> str:

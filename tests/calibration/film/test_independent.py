@@ -144,6 +144,9 @@ def test_what_is_fitted_along_is_found_and_takes_its_harm_with_it(key: str, whic
     assert one.value == pytest.approx(size, abs=0.25 * size + 4.0 * one.uncertainty)
     assert found.likely == []
     assert set(shifts) == {"stiffness", "eps_r"} and all(shift != 0.0 for shift in shifts.values())
+    truth = {"eps_r": 1.7, "stiffness": secant_modulus(Cone(**ONE_TERM), *found.stretch)}
+    for quantity, value in truth.items():
+        assert abs(found.quantities[quantity].value - value) < 3.0 * found.quantities[quantity].uncertainty
     plain = identify(curves, terms=1, starts=1).material
     before = {"eps_r": plain.eps_r, "stiffness": model_secant_modulus(plain, *found.stretch)}
     for quantity, shift in shifts.items():
