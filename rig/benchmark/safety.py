@@ -13,8 +13,8 @@ import platform
 import random
 import signal
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,6 +28,8 @@ from rig.benchmark.stand import Run, Stand
 from rig.safety.heartbeat import DEADLINE_S, INTERVAL_S
 from rig.safety.limits import FilmLimits, Limits
 from rig.scene.scene import load_scene
+from rig.sim.bench import SimulatedBench
+from rig.sim.wire import FrameWire
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -40,9 +42,15 @@ BEATS, MODEL = "interval between heartbeats", "answer of the film's model"
 TRIALS = BEATS, MODEL
 ALLOWED_MS = {KILLED: 50.0, STOPPED: 200.0, SPINNING: 200.0, GUARD: 200.0, GUARD_STOPPED: 300.0, BACK: 1000.0}
 ALLOWED_MS |= {BEATS: DEADLINE_S * 1e3, MODEL: 2.0}
-QUICK = {KILLED: 20, STOPPED: 6, SPINNING: 6, GUARD: 10, GUARD_STOPPED: 6, BACK: 6}
+FLOODED = ", bus flooded"  # by somebody else's frames
+FLOOD_HZ = 1000
+KINDS = (KILLED, GUARD, STOPPED, GUARD_STOPPED, BACK)  # that are tried on a flooded bus too
+ALLOWED_MS |= {kind + FLOODED: ALLOWED_MS[kind] for kind in KINDS}
+QUICK = {KILLED: 20, STOPPED: 6, SPINNING: 6, GUARD: 10, GUARD_STOPPED: 6, BACK: 6, KILLED + FLOODED: 4}
 TRIES = 5
 FULL = {KILLED: 200, STOPPED: 100, SPINNING: 40, GUARD: 200, GUARD_STOPPED: 100, BACK: 60}
+FULL |= {kind + FLOODED: FULL[kind] for kind in KINDS}
+PARTS = "safety_parts.json"  # what a benchmark that was broken off had measured
 PULLED_S = 0.3  # how long the adapter is out
 LATEST_S = 10.0  # an output that is not commanded off by then never will be
 
@@ -59,6 +67,7 @@ class Row:
     without: int = 0
     never: int = 0
     loads: list[float] = field(default_factory=list)  # of the machine (one minute), beside each time
+    runs: int = 0  # done, with whatever end
 
     def quantile(self, share: float) -> float:
         """Linear between the values; NaN when there are none."""
@@ -74,26 +83,82 @@ class Report:
     environment: dict[str, str]
 
 
-def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None) -> Report:
-    """Measure, and write ``safety.json`` and ``safety.png``."""
-    numbers = FULL if full else QUICK
-    rows: list[Row] = []
-    total, done = sum(numbers.values()), 0
+def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None, number: int | None = None) -> Report:
+    """Measure, and write ``safety.json`` and ``safety.png``; ``number`` of runs of every kind, where it is given.
+
+    After each run what has been measured is kept in ``safety_parts.json``: broken off and started again with the same
+    numbers, the benchmark goes on from there.
+    """
+    numbers = dict.fromkeys(FULL, number) if number is not None else FULL if full else QUICK
+    rows = _kept(out_dir / PARTS, numbers)
+    total = sum(numbers.values())
+    out_dir.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix="dea-rig-safety-") as name, Stand(Path(name)) as stand:
         beats = Row(BEATS)
-        whole_run(stand, beats)
-        rng = random.Random(1)
-        for what, number in numbers.items():
-            row = Row(what)
-            rows.append(row)
-            for _ in range(number):
-                progress(done / total, what)
-                measure(stand, row, None, rng)
-                done += 1
+        _undisturbed(stand, beats)
+        rng = random.Random()
+        for row in rows:
+            with flood(stand, FLOOD_HZ if row.what.endswith(FLOODED) else 0):
+                while row.runs < numbers[row.what]:
+                    done = sum(one.runs for one in rows)
+                    progress(done / total, f"{row.what}: {row.runs} of {numbers[row.what]}, median {_ms(row)}")
+                    with suppress(RigError):  # a machine too busy for a run to come to its voltage: another one
+                        measure(stand, row, None, rng)
+                    row.runs += 1
+                    _keep(out_dir / PARTS, numbers, rows)
         rows += [beats, model_answers(stand)]
     report = Report(full, rows, _environment())
     save(report, out_dir)
+    (out_dir / PARTS).unlink(missing_ok=True)
     return report
+
+
+def _ms(row: Row) -> str:
+    return f"{row.quantile(0.5):.0f} ms, longest {max(row.ms):.0f} ms" if row.ms else "not known yet"
+
+
+def _keep(path: Path, numbers: dict[str, int], rows: list[Row]) -> None:
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps({"numbers": numbers, "rows": [asdict(row) for row in rows]}), encoding="utf-8")
+    part.replace(path)
+
+
+def _kept(path: Path, numbers: dict[str, int]) -> list[Row]:
+    """The rows of a benchmark of the same numbers that was broken off; empty ones where there is none."""
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        rows = [Row(**row) for row in kept["rows"]]
+        if kept["numbers"] == numbers and [row.what for row in rows] == list(numbers):
+            return rows
+    return [Row(what) for what in numbers]
+
+
+@contextmanager
+def flood(stand: Stand, rate: int) -> Iterator[None]:
+    """``rate`` frames a second of somebody else's on the supply's bus, as long as this lasts."""
+    ending = threading.Event()
+    bundle = 10
+
+    def bundled(bench: SimulatedBench) -> None:
+        wire = bench.wire("hv")
+        assert isinstance(wire, FrameWire)
+        for k in range(bundle):
+            wire.send((0x100 + k, bytes(8)), bench.now)
+
+    def send() -> None:
+        while not ending.wait(bundle / rate):
+            with suppress(Exception):  # the bus may be out at this moment
+                stand.do(bundled)
+
+    thread = threading.Thread(target=send)
+    if rate:
+        thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        if rate:
+            thread.join()
 
 
 def whole_run(stand: Stand, beats: Row | None = None) -> float:
@@ -133,15 +198,16 @@ def measure(stand: Stand, row: Row, instant: float | None, rng: random.Random) -
     if run.status is not None:  # it was faster this time
         row.without += 1
         return run
-    pid = run.guard if row.what in (GUARD, GUARD_STOPPED) else run.engine
+    what = row.what.removesuffix(FLOODED)
+    pid = run.guard if what in (GUARD, GUARD_STOPPED) else run.engine
     stopping = {STOPPED: signal.SIGSTOP, GUARD_STOPPED: signal.SIGSTOP, SPINNING: signal.SIGUSR1}
     try:
-        if row.what == BACK:
+        if what == BACK:
             pulled = stand.pull("hv")
             stand.wait(lambda: stand.bench.clock.now() > pulled + PULLED_S, "its return")
             at = stand.plug_in("hv")
         else:
-            at = stand.kill(pid, stopping.get(row.what, signal.SIGKILL))
+            at = stand.kill(pid, stopping.get(what, signal.SIGKILL))
     except ProcessLookupError:  # it has ended this very moment
         row.without += 1
         stand.wait_until_alone(run)
@@ -157,18 +223,18 @@ def measure(stand: Stand, row: Row, instant: float | None, rng: random.Random) -
             row.loads.append(os.getloadavg()[0])
         except RigError:
             row.never += 1
-    if row.what in (STOPPED, SPINNING):
+    if what in (STOPPED, SPINNING):
         stand.kill(run.engine)
     stand.wait_until_alone(run)
     return run
 
 
-def _undisturbed(stand: Stand) -> float:
+def _undisturbed(stand: Stand, beats: Row | None = None) -> float:
     """`whole_run`; a busy machine may hold an engine up for longer than the guard bears, so a few are tried."""
     for _ in range(TRIES - 1):
         with suppress(RigError):
-            return whole_run(stand)
-    return whole_run(stand)
+            return whole_run(stand, beats)
+    return whole_run(stand, beats)
 
 
 def kill_many(folder: Path, number: int, at_once: int, seed: int) -> Row:

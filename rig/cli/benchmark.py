@@ -68,12 +68,18 @@ def _log(full: bool, out: Path) -> None:
 
 
 @command.command("safety")
+@click.option("--number", type=click.IntRange(1, 10_000), help="Runs of every kind, in place of the usual numbers.")
 @_options
-def _safety(full: bool, out: Path) -> None:
-    """How soon the voltage is off when the engine or the guard is killed or hangs, over real processes."""
+def _safety(full: bool, out: Path, number: int | None) -> None:
+    """How soon the voltage is off when the engine or the guard is killed or hangs, over real processes.
+
+    Broken off and started again with the same numbers, it goes on from where it was.
+    """
+    from functools import partial
+
     from rig.benchmark import safety
 
-    _benchmark(safety.run, safety.render, "safety", full, out)
+    _benchmark(partial(safety.run, number=number), safety.render, "safety", full, out)
 
 
 def _benchmark(run: Callable[..., Any], render: Callable[..., Any], name: str, full: bool, out: Path) -> None:

@@ -19,6 +19,7 @@ from rig.operator.status import Status
 from rig.protocol.experiment import Experiment, prepare
 from rig.run.run import Consent
 from rig.run.run import run as run_experiment
+from rig.safety.arming import UNDETECTABLE
 
 
 def prepare_step(scene: Path, title: str, step: Mapping[str, Any], ports: dict[str, Any] | None) -> Experiment:
@@ -59,6 +60,8 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
 
     try:
         with Display(f"{word}: {kind}. {scene.specimen.name}: {experiment.protocol.title}", word) as display:
+            if arm and highest > 0 and scene.on_real_ports:
+                display.say(UNDETECTABLE)
             outcome = run_experiment(experiment, out, lambda done, total, label: None, consent, display.say, show=show)
     except (RigError, DeviceError) as error:
         if not begun and scene.on_real_ports and isinstance(error, FaultError | DeviceError):

@@ -9,6 +9,12 @@ from __future__ import annotations
 
 from rig.base.errors import FaultError
 
+UNDETECTABLE = (
+    "What cannot be detected from here: a supply whose status and reading are wrong at once; program and guard both "
+    "stopped; power lost. Interlock, emergency stop and grounding stick are for that."
+)
+"""Said whenever high voltage is asked for on ports."""
+
 
 class Arming:
     """Whether the operator allows high voltage, and how much.
