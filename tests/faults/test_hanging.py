@@ -45,6 +45,59 @@ int tcdrain(int fd) {
 }
 """
 
+# One that tells of every call that would wait: a port drained, a read where nothing is, a write where there is no room,
+# on lines, sockets and pipes that are not told to return at once; and of every wait for a disk.
+WAITS = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <stdio.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+static void tell(const char *what, int fd) {
+    char line[80];
+    int said = syscall(SYS_openat, AT_FDCWD, WHERE, O_WRONLY | O_CREAT | O_APPEND, 0600);
+    int n = snprintf(line, sizeof line, "%d %s %d\\n", getpid(), what, fd);
+    syscall(SYS_write, said, line, n);
+    syscall(SYS_close, said);
+}
+static int waits(int fd, short event) {
+    struct stat is;
+    struct pollfd now = {fd, event, 0};
+    if (fstat(fd, &is) || S_ISREG(is.st_mode) || S_ISDIR(is.st_mode)) return 0;
+    if (fcntl(fd, F_GETFL) & O_NONBLOCK) return 0;
+    return poll(&now, 1, 0) == 0;
+}
+int tcdrain(int fd) { tell("tcdrain", fd); return 0; }
+int fsync(int fd) { tell("fsync", fd); return syscall(SYS_fsync, fd); }
+int fdatasync(int fd) { tell("fdatasync", fd); return syscall(SYS_fdatasync, fd); }
+ssize_t read(int fd, void *to, size_t n) {
+    if (waits(fd, POLLIN)) tell("read", fd);
+    return syscall(SYS_read, fd, to, n);
+}
+ssize_t write(int fd, const void *from, size_t n) {
+    if (waits(fd, POLLOUT)) tell("write", fd);
+    return syscall(SYS_write, fd, from, n);
+}
+ssize_t recv(int fd, void *to, size_t n, int how) {
+    if (!(how & MSG_DONTWAIT) && waits(fd, POLLIN)) tell("recv", fd);
+    return syscall(SYS_recvfrom, fd, to, n, how, 0, 0);
+}
+"""
+CHECK_WAITS = """
+import os, socket, threading
+a, b = socket.socketpair()
+threading.Timer(0.5, b.send, [b"12"]).start()
+a.recv(1)
+os.read(a.fileno(), 1)
+r, w = os.pipe()
+threading.Timer(0.5, os.write, [w, b"1"]).start()
+os.read(r, 1)
+"""
+
 
 def start_live(stand: Stand) -> Run:
     """A run with 800 V on. A machine too busy rightly ends some before: then another."""
@@ -102,6 +155,29 @@ def test_nothing_waits_for_a_port_to_send(tmp_path: Path, monkeypatch: pytest.Mo
             stand.wait_until_alone(run)
             assert run.status == (4 if kill else 0), run.said
     assert not called.exists()
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_neither_loop_makes_a_call_that_could_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A whole run with voltage: what guard and engine asked of the system, told by a C library in between."""
+    called, source, library = tmp_path / "called", tmp_path / "waits.c", tmp_path / "waits.so"
+    source.write_text(WAITS.replace("WHERE", json.dumps(str(called))))
+    subprocess.run(["cc", "-shared", "-fPIC", "-w", "-o", library, source], check=True)
+    preloaded = {**os.environ, "LD_PRELOAD": str(library)}
+    subprocess.run([sys.executable, "-c", CHECK_WAITS], env=preloaded, check=True)
+    assert [line.split()[1] for line in called.read_text().splitlines()] == ["recv", "read"]  # it tells of what waits
+    called.unlink()
+    with monkeypatch.context() as patch, Stand(tmp_path / "stand", hold_s=1.0) as stand:
+        patch.setenv("LD_PRELOAD", str(library))
+        run = start_live(stand)
+        guard, engine = run.guard, run.engine
+        assert all(str(library) in Path(f"/proc/{pid}/maps").read_text() for pid in (guard, engine))
+        called.unlink(missing_ok=True)  # from here on: the loops, with voltage on
+        stand.wait(lambda: stand.bench.voltage() < 60.0, "the output's end")
+        told = called.read_text().splitlines() if called.exists() else []
+        stand.wait_until_alone(run)
+    assert run.status == 0, run.said
+    assert not [line for line in told if int(line.split()[0]) in (guard, engine)]
 
 
 def test_an_adapter_that_takes_nothing_is_lost_and_said(stand: Stand, live: Run) -> None:
