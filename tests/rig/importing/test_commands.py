@@ -132,3 +132,10 @@ def test_a_rig_s_table_that_cannot_be_is_refused_or_warned_of(tmp_path: Path, ol
     result = CliRunner().invoke(main, ["fit", str(path), "--scene", str(scene), "--dry-run"])
     assert words in result.output
     assert "warning" in result.output if words == "kV" else result.exit_code == 2
+
+
+def test_a_folder_is_taken_for_its_logs(tmp_path: Path) -> None:
+    """Not refused as a file that is none: what it holds is looked for."""
+    (tmp_path / "logs").mkdir()
+    result = CliRunner().invoke(main, ["fit", str(tmp_path / "logs")])
+    assert result.exit_code == 2 and "there is no log (*.mcap) in this folder" in result.output
