@@ -12,6 +12,7 @@ import contextlib
 import errno
 import logging
 import os
+import re
 import select
 import threading
 import time
@@ -26,6 +27,7 @@ from drivers.instruments.gsv8.device import GSV8
 from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.instruments.keyence_lkg import UNANSWERED, KeyenceLKG
 from drivers.instruments.shvps import Shvps
+from drivers.instruments.zaber.device import ZaberStage
 from drivers.links import serial_link
 from drivers.links.link import CanFrame, DeviceError, DeviceSilent
 from drivers.links.port_lock import PortLock, one_name
@@ -139,6 +141,22 @@ def test_a_supply_that_boots_is_waited_for_and_nothing_is_set(on_port: OnPort) -
     assert b"S" not in there.got.replace(b"SwMode", b"")
 
 
+def stage(data: bytes) -> bytes:
+    replies = b""
+    for line in data.splitlines():
+        device, axis, number, *words = line.decode()[1:].partition(":")[0].split()
+        values = {"get resolution": "64", "get limit.max": "305381", "get maxspeed": "1000", "warnings": "00"}
+        text = f"{int(device):02d} {axis} {number} OK IDLE -- {values.get(' '.join(words), '0')}"
+        replies += f"@{text}:{-sum(text.encode()) & 0xFF:02X}\r\n".encode()
+    return replies
+
+
+def test_a_stage_that_boots_is_waited_for_and_not_moved(on_port: OnPort) -> None:
+    there, link = on_port(stage, boot_s=0.5)
+    poll_until_ready(ZaberStage("stage", link, timeout_s=0.05, boot_s=3.0))
+    assert there.got.count(b"/1 0 ") > 8 and not re.search(rb"move|home", there.got)
+
+
 class Node:
     """A CAN bus in memory whose only node has not started: ``boots_at`` is when it says so and begins to answer."""
 
@@ -215,6 +233,12 @@ def laser(link: SerialLink) -> KeyenceLKG:
         (laser, Controller("+0012345"), ["M0,+0012345", "no decimal point"]),
         (laser, Controller("+00350.1"), ["M0,+00350.1", "micrometres"]),
         (force, lambda data: b"ER,\xaa,00\r", ["45 52 2c"]),
+        (lambda link: ZaberStage("stage", link, timeout_s=0.02), lambda data: b"M1,+01.2345\r", ["a Keyence LK-G"]),
+        (
+            lambda link: ZaberStage("stage", link, timeout_s=0.02),
+            lambda data: b"\xaa\x9f\x85\xe0",
+            ["aa 9f 85", "baud"],
+        ),
         (lambda link: Shvps("hv", link, timeout_s=0.02), lambda data: b"M1,+01.2345\r", ["a Keyence LK-G"]),
         (
             lambda link: AsciiForce("force", link, rate_Hz=100, boot_s=0.1, timeout_s=0.05),

@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
+from drivers.heard import Heard
 from drivers.instruments.zaber.codec import (
     FLAGS,
     REJECTIONS,
@@ -75,6 +76,8 @@ class ZaberStage:
         How long to wait for each reply.
     full_step_um : float
         Travel per full motor step: 31.75 um is a 6.35 mm screw on a motor of 200 steps, as in the X-LSQ150B.
+    boot_s : float
+        How long the first answer may take.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class ZaberStage:
         poll_rate_Hz: float = 50.0,
         timeout_s: float = 0.25,
         full_step_um: float = 31.75,
+        boot_s: float = 0.0,
     ) -> None:
         self.name = name
         self.identity = Identity()
@@ -98,8 +102,10 @@ class ZaberStage:
         self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
         self._full_step = full_step_um * 1e-6
         self._codec = Codec(self.counters)
+        self._boot_s = boot_s
+        self._heard = Heard()
         self._dialogue: Dialogue[_Command, Reply] = Dialogue(
-            self._label, self._send, self.counters, timeout_s=timeout_s
+            self._label, self._send, self.counters, timeout_s=timeout_s, heard=self._heard
         )
         # A stop does not wait for the answer to something else, so it has a dialogue of its own; ids keep them apart.
         self._urgent: Dialogue[_Command, Reply] = Dialogue(
@@ -232,7 +238,7 @@ class ZaberStage:
     def poll(self, now: float) -> Sequence[StageSample]:
         self._now = now
         try:
-            self._inbox.extend(self._codec.feed(self._link.read()))
+            self._inbox.extend(self._codec.feed(self._heard.bytes(self._link.read())))
             while self._inbox:
                 self._take(self._inbox.popleft(), now)
             if self._ready and self._dialogue.idle and self._schedule.take(now):
@@ -287,7 +293,7 @@ class ZaberStage:
             self._second.heard_again(message)
 
     def _set_up(self) -> Script[_Command, Reply]:
-        yield from self._ask("", axis=0)
+        yield from self._ask("", axis=0, boot_s=self._boot_s)
         device_id = yield from self._number("get deviceid", axis=0)
         serial = yield from self._number("get system.serial", axis=0)
         version = (yield from self._ask("get version", axis=0)).message.data
@@ -467,9 +473,16 @@ class ZaberStage:
         self._accepted_at = answer.received
 
     def _ask(
-        self, words: str, *, axis: int | None = None, repeat: bool = True, may_fail: bool = False
+        self,
+        words: str,
+        *,
+        axis: int | None = None,
+        repeat: bool = True,
+        may_fail: bool = False,
+        boot_s: float = 0.0,
     ) -> _Part[Answer[Reply]]:
-        answer = yield Ask(_Command(words, self._axis if axis is None else axis), repeat=repeat)
+        command = _Command(words, self._axis if axis is None else axis)
+        answer = yield Ask(command, repeat=repeat, boot_s=boot_s)
         reply = answer.message
         self._shown = reply.warning
         if reply.busy:
