@@ -345,7 +345,8 @@ class Engine:
 
     def _tell(self, turns: Turns, error: LimitError | FaultError) -> None:
         """Let the action know what ends it. A breakdown may be its result; whatever else it does, the error stands."""
-        if self.guard is not None and not _lets_ramp_down(error):
+        latched = self.guard is None or self.guard.state is GuardState.SAFE  # a guard in its own process has acted
+        if self.guard is not None and not latched and not _lets_ramp_down(error):
             with suppress(Exception):  # the teardown does it again
                 self.guard.kill(str(error))  # first: what an action does now takes its time
         try:
@@ -453,12 +454,12 @@ class Engine:
 
     def _take(self, role: str, sample: Sample, now: float) -> None:
         sample = self.recorder.add(sample)
+        if self.rig.listener is not None:  # before the guard judges it: then the same wherever the guard is
+            self.rig.listener(sample)
         if isinstance(sample, HVSample) and self.guard is not None:
             self.guard.on_sample(sample)
         if self._watch is not None:
             self._watch.sample(role, sample, now)
-        if self.rig.listener is not None:
-            self.rig.listener(sample)
 
     def _outcome(self, status: str, reason: str, rest: Rest) -> Outcome:
         recorder = self.recorder
