@@ -73,6 +73,64 @@ def margin(problem: Problem, found: Stations) -> Array:
     return _least(found.log1, stiffness(problem, found))
 
 
+FAN = (0.25, 0.5, 0.75, 1.0, 1.1)  # of the way from the pre-stretched film to a point, and somewhat beyond
+CLEAR = 0.05  # of what the determinant is without Maxwell stress
+
+
+def clear(problem: Problem, grid: Grid, state: State, lam: Array) -> NDArray[np.bool_]:
+    """Whether ``W*(l1, l2)`` is convex in both stretches over all that lies between rest and the film's points.
+
+    The energy is an integral of W* over ``l1 = |d(r, z)/dR| lp`` and ``l2 = r/R lp``. Where W* is convex in both and
+    rises with the first it is convex in (r, z), and has one minimum: at this voltage, and at every lower one, since the
+    Maxwell stress enters in proportion. The state is then on the branch from rest, and the only one so far out.
+    """
+    at = evaluate(problem, grid, state)
+    edge = edges(problem, grid, state, at, lam)
+    states = len(lam)
+    share = np.array(FAN)[:, None, None]
+
+    def fan(inside: Array, ends: Array) -> Array:
+        far = np.concatenate((inside.reshape(-1, states), ends)) - problem.log_prestretch
+        return problem.log_prestretch + share * far
+
+    law = stress(problem.film, stack(fan(at.log[0], edge.log1), fan(at.log[1], edge.log2)))
+    rest = 0.0 if law.maxwell is None else law.maxwell
+    along, around = law.h11 - law.t1, law.h22 - law.t2
+    bare = (along + rest) * (around + rest)
+    convex = (along > 0.0) & (around > 0.0) & (along * around - law.h12 * law.h12 > CLEAR * bare) & (law.t1 >= 0.0)
+    return np.asarray(convex.all(axis=(0, 1)))
+
+
+SHARES = (0.0, 0.5, 1.0)  # of the radial displacement
+SAFE = 0.96  # of the coupling that would make the energy flat
+
+
+def between(problem: Problem, grid: Grid, state: State) -> NDArray[np.bool_]:
+    """Whether the energy is convex from the taut film with ``r = R`` to these taut states, at every point.
+
+    In ``q = dr/dR - 1``, ``w`` and ``e = r/R - 1``. As ``e q R^2 dx`` has the integral ``[R^2 e^2/2] = 0`` between
+    clamped edges, any multiple of ``e q`` may be added: what counts is whether one multiple makes every point convex.
+    """
+    e1, q1 = grid.strain(state.c)
+    share = np.array(SHARES)[:, None, None, None]
+    e, q = share * e1, share * q1
+    metric = (1.0 + q) ** 2 + state.w * state.w
+    log1, hoop = 0.5 * np.log(metric) + problem.log_prestretch, np.log1p(e) + problem.log_prestretch
+    law = stress(problem.film, stack(log1, hoop))
+    along, down, around = (1.0 + q) / metric, state.w / metric, 1.0 / (1.0 + e)
+    tm, d = law.t1 / metric, law.h11 - 2.0 * law.t1
+    qw, ww, we = d * along * down, d * down * down + tm, law.h12 * down * around
+    # The slope is eliminated, as Newton does it.
+    qq = d * along * along + tm - qw * qw / ww
+    qe = law.h12 * along * around - qw * we / ww
+    ee = (law.h22 - law.t2) * around * around - we * we / ww
+    axes = (0, 1, 2)
+    good = ((ww > 0.0) & (qq > 0.0) & (ee > 0.0)).all(axis=axes)
+    room = SAFE * np.sqrt(np.maximum(qq * ee, 0.0))
+    low, high = (-qe - room).max(axis=axes), (room - qe).min(axis=axes)
+    return np.asarray(good & (low < high))
+
+
 def stiffness(problem: Problem, found: Stations) -> Array:
     """``d2W*/dl1^2``, relaxed where the film wrinkles, as a share of that without Maxwell stress; -1 without a law."""
     law = stress(problem.film, stack(found.log1, found.hoop))

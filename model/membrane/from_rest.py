@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Array
-from model.membrane import continuation, convexity, tension_field
+from model.membrane import continuation, convexity, refinement, tension_field
 from model.membrane.refinement import Answer, Start, refine
-from model.membrane.ritz import Problem
+from model.membrane.ritz import Problem, State, guess
 
 TRACE_MODES = 10
 CLOSE = 2e-3  # of V^2: a path that ended so close below the wanted voltage is followed again, with cuts
 BACK = (0.03, 0.3)  # of V^2: where that begins
 STEP = 1e-5  # of V^2: its smallest step
 SOFT = 0.1  # stiffness below which a path that ends has met the loss of convexity
+CHECK_MODES = 6  # of a way that is only looked at
+WAY = (2, 5)  # steps of V^2 to an answer that is there already: so many, and then so many
+WAY_GOAL, WAY_STEPS = 3e-2, 8  # of Newton on that way
 ROUGH = 1e-6  # tolerance on the way
 
 
@@ -65,6 +68,56 @@ def solve(problem: Problem, tolerance: float, *, relaxed: bool, sensitivities: b
             answer.index = one[answer.index]
             answers.append(_convex(problem, answer))
     return answers, ended
+
+
+def clear(problem: Problem, end: Start, lam: Array, tolerance: float) -> NDArray[np.bool_]:
+    """Whether wrinkled states are on the branch from rest by their energy, with all their zones."""
+    good = tension_field.complete(problem, end.grid, end.state, tolerance)
+    return good & convexity.clear(problem, end.grid, end.state, lam)
+
+
+def connected(problem: Problem, end: Start, lam: Array) -> NDArray[np.bool_]:
+    """Whether taut states are on the branch from rest: by their energy, or since a few steps of the voltage lead there.
+
+    The steps are as short as `continuation` asks for, so that following the state would lead to it as well.
+    """
+    everyone = np.arange(len(lam))
+    good = convexity.between(problem, end.grid, end.state)
+    rest = np.flatnonzero(~good)
+    if len(rest):
+        bare = continuation.at(problem, rest, np.ones(len(rest)))
+        laid = end.grid.take(rest)
+        found = refinement.newton(bare, laid, guess(bare, laid), WAY_GOAL, WAY_STEPS)
+        rest, begun = rest[found.ok], found.state.take(found.ok)
+        for steps in WAY:
+            if len(rest) == 0:
+                break
+            led = _led(problem.take(rest), end.take(rest), begun, steps)
+            good[rest[led]] = True
+            rest, begun = rest[~led], begun.take(~led)
+    some = everyone[good]
+    if len(some):
+        part = end.take(some)
+        stations = convexity.stations(problem.take(some), part.grid, part.state, lam[some])
+        good[some] = convexity.margin(problem.take(some), stations) > 0.0
+    return good
+
+
+def _led(problem: Problem, end: Start, begun: State, steps: int) -> NDArray[np.bool_]:
+    """Whether so many steps of V^2 lead from ``begun`` without voltage to ``end``, none of them a jump."""
+    everyone = np.arange(len(problem.span))
+    good = np.ones(len(everyone), dtype=np.bool_)
+    before = last = begun
+    for k in range(1, steps):
+        share = 1.0 / (steps - k + 1)
+        w = last.w + share * (end.state.w - last.w)
+        first = State(last.c + share * (end.state.c - last.c), w)
+        part = continuation.at(problem, everyone, np.full(len(everyone), 1.0 + k / steps))
+        found = refinement.newton(part, end.grid, first, WAY_GOAL, WAY_STEPS)
+        good &= found.ok & (np.abs(found.state.w / w - 1.0).max(axis=(0, 1)) < continuation.CORRECTION)
+        before, last = last, found.state
+    ahead = 2.0 * last.w - before.w
+    return np.asarray(good & (np.abs(ahead / end.state.w - 1.0).max(axis=(0, 1)) < continuation.CORRECTION))
 
 
 def settled(

@@ -143,9 +143,10 @@ def _largest(grid: Grid, values: Array, ends: Array) -> tuple[Array, Array]:
         angle = np.pi / (FINE - 1) * (place + np.array([[-1], [0], [1]]))
         low, xi, high = -np.cos(np.clip(angle, 0.0, np.pi))
         for _ in range(POLISH):
-            _, slope, curve = series(c, xi)
-            xi = np.clip(np.where(curve < 0.0, xi - slope / curve, xi), low, high)
-        peak = series(c, xi)[0]
+            value, slope, curve = series(c, xi)
+            step = np.clip(np.where(curve < 0.0, xi - slope / curve, xi), low, high) - xi
+            xi = xi + step
+        peak = value + step * (slope + 0.5 * curve * step)  # the last step is so short that its cube is nothing
         better = peak > best[kind, state]
         x0, x1 = grid.breaks[element, state], grid.breaks[element + 1, state]
         at = np.exp(x0 + 0.5 * (1.0 + xi) * (x1 - x0))
@@ -184,9 +185,11 @@ def extremes(problem: Problem, grid: Grid, state: State, at: Points, lam: Array)
     )
 
 
-# Shares of the way from the pre-stretched film to the widest point at which the law is looked at; and what a share of
-# the hoop's stiffness counts beside one of the meridian's: a circle is held by its neighbours.
-WAY = (0.25, 0.5, 0.75, 1.0)
+# Shares of the way from the pre-stretched film to the widest point at which the law is looked at, the last ones where
+# the way is ``FAR``; and what a share of the hoop's stiffness counts beside one of the meridian's: a circle is held by
+# its neighbours.
+WAY, MORE_OF_WAY = (0.5, 1.0), (0.25, 0.75)
+FAR = 1.2  # of ln(l1 l2)
 HOOP = 0.7
 
 
@@ -201,15 +204,24 @@ def _softened(problem: Problem, log: Array, edge: Edges) -> Array:
     log2 = np.concatenate((log[1].reshape(-1, states), edge.log2))
     widest, columns = (log1 + log2).argmax(axis=0), np.arange(states)
     start = problem.log_prestretch
-    share = np.array(WAY)[:, None]
-    way = [start + share * (x[widest, columns] - start) for x in (log1, log2)]
-    law = stress(problem.film, stack(way[0], way[1]))
+    far1, far2 = log1[widest, columns] - start, log2[widest, columns] - start
+    softened = _along(problem, far1, far2, WAY)
+    far = np.flatnonzero(far1 + far2 > FAR)
+    if len(far):
+        softened[far] = np.maximum(softened[far], _along(problem.take(far), far1[far], far2[far], MORE_OF_WAY))
+    return softened
+
+
+def _along(problem: Problem, far1: Array, far2: Array, shares: tuple[float, ...]) -> Array:
+    """Largest share of a stiffness that the voltage takes at ``shares`` of the way to the log stretches ``far``."""
+    share = np.array(shares)[:, None]
+    law = stress(problem.film, stack(problem.log_prestretch + share * far1, problem.log_prestretch + share * far2))
     assert law.maxwell is not None
     twice = 2.0 * law.maxwell
-    both = np.maximum(twice / (law.h11 + twice), HOOP * twice / (law.h22 + twice))
+    along, around = law.h11 + twice, law.h22 + twice
+    both = np.maximum(twice / along, HOOP * twice / around)
     # Where the elastic law itself gives way there is nothing left to share.
-    both = np.where((law.h11 + twice > 0.0) & (law.h22 + twice > 0.0), both, 1.0)
-    softened: Array = both.max(axis=0)
+    softened: Array = np.where((along > 0.0) & (around > 0.0), both, 1.0).max(axis=0)
     return softened
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -21,7 +21,8 @@ MOST_STEPS = 25
 # Newton's step leaves an error of about the square of its relative size; the change of the force from one resolution to
 # the next is the error of the coarser one, some times the error of the finer. Tests hold both factors to the truth.
 NEWTON_FACTOR = 0.3
-LEVEL_FACTOR = 1.0
+LEVEL_FACTOR = 0.5
+CUT_LEVEL_FACTOR = 1.0  # with cuts, which move from one resolution to the next
 # Near loss of convexity a finer resolution gains less, and two may agree by chance: the change before counts as well.
 SOFT_LEVEL_FACTOR = 2.0
 SOFT_BEFORE_FACTOR = 0.2
@@ -30,6 +31,7 @@ ROUND_OFF = 1e-13
 # the second and zero is round-off.
 CLEARLY_NEGATIVE = -1e-2
 ROUND_OFF_TENSION = -1e-9
+MANY = 50  # states from which on those that have settled are worth leaving behind
 LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two resolutions may agree by chance
 
 
@@ -47,30 +49,44 @@ class Iterate:
     steps: NDArray[np.intp]
     hoop: Array | None = None  # least hoop over largest meridional stress at the points, before the last step
 
-    def take(self, index: ritz.Index) -> Iterate:
-        """The states at ``index``."""
-        return Iterate(
-            self.grid.take(index),
-            self.state.take(index),
-            self.lam[index],
-            self.change[index],
-            self.tail[index],
-            self.stable[index],
-            self.ok[index],
-            self.steps[index],
-            None if self.hoop is None else self.hoop[index],
-        )
+    def _pairs(self, other: Iterate) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+        """Every array with that of the other, but for the grids."""
+        mine, its = self.state, other.state
+        yield from ((mine.c, its.c), (mine.w, its.w), (self.lam, other.lam), (self.change, other.change))
+        yield from ((self.tail, other.tail), (self.stable, other.stable), (self.ok, other.ok))
+        yield self.steps, other.steps
+        if self.hoop is not None and other.hoop is not None:
+            yield self.hoop, other.hoop
+        if mine.natural is not None and its.natural is not None:
+            yield mine.natural, its.natural
+        if mine.relaxed is not None and its.relaxed is not None and mine.relaxed.flags.writeable:
+            yield mine.relaxed, its.relaxed
+
+    def restore(self, old: Iterate, these: NDArray[np.bool_]) -> None:
+        """Take back ``these`` of an earlier step."""
+        if self.grid is not old.grid:
+            breaks = np.where(these, old.grid.breaks, self.grid.breaks)
+            self.grid = Grid.lay(self.grid.table.modes, breaks)
+        for mine, its in self._pairs(old):
+            np.copyto(mine, its, where=these)
+
+    def put(self, index: NDArray[np.intp], other: Iterate) -> None:
+        """Take over other iterates of the states at ``index``."""
+        breaks = self.grid.breaks.copy()
+        breaks[:, index] = other.grid.breaks
+        self.grid = Grid.lay(self.grid.table.modes, breaks)
+        for mine, its in self._pairs(other):
+            mine[..., index] = its
 
 
 class Finished:
     """Iterates put aside at the step that finished them, so that none depends on how long the others need."""
 
     def __init__(self, states: int) -> None:
-        self.states = states
-        self.parts: list[tuple[NDArray[np.intp], Iterate]] = []
-        self.running = np.arange(states)
         self.here = np.ones(states, dtype=np.bool_)  # of those running, which are not put aside yet
         self.fresh = self.here  # which end at this step
+        self.last: Iterate | None = None  # of those running: all that are put aside
+        self.left: list[tuple[Iterate, NDArray[np.intp]]] = []  # those left behind, and who of them went on
 
     def ending(self, ended: NDArray[np.bool_]) -> bool:
         """Whether some ``ended`` at this step, which `put` then takes."""
@@ -79,58 +95,49 @@ class Finished:
 
     def put(self, every: Iterate) -> bool:
         """Put aside those of ``every`` running one that end here; whether all have."""
-        fresh = self.fresh
-        self.parts.append((self.running[fresh], every if fresh.all() else every.take(fresh)))
-        self.here = self.here & ~fresh
+        if self.last is not None:
+            every.restore(self.last, ~self.here)
+        self.last = every
+        self.here = self.here & ~self.fresh
         return not self.here.any()
 
     def rest(self) -> NDArray[np.intp] | None:
         """Those to go on with, by their place among the running ones, when the others are worth leaving behind."""
-        if 2 * np.count_nonzero(self.here) > len(self.here):
+        count = len(self.here)
+        if count < MANY or self.last is None or 2 * np.count_nonzero(self.here) > count:
             return None
         rest = np.flatnonzero(self.here)
-        self.running, self.here = self.running[rest], np.ones(len(rest), dtype=np.bool_)
+        self.left.append((self.last, rest))
+        self.last, self.here = None, np.ones(len(rest), dtype=np.bool_)
         return rest
 
     def all(self) -> Iterate:
         """Every state's iterate, in order."""
-        if len(self.parts) == 1:
-            return self.parts[0][1]
-        order = np.argsort(np.concatenate([index for index, _ in self.parts]), kind="stable")
-        found = [part for _, part in self.parts]
-
-        def joined(values: list[Any]) -> Any:
-            return np.concatenate(values, axis=-1)[..., order]
-
-        def maybe(values: list[Any]) -> Any:
-            return joined([x for x in values if x is not None]) if values[0] is not None else None
-
-        table = found[0].grid.table
-        grid = Grid.lay(table.modes, joined([part.grid.breaks for part in found]))
-        states = [part.state for part in found]
-        relaxed = maybe([None if x.relaxed is None else np.broadcast_to(x.relaxed, x.w.shape) for x in states])
-        state = State(
-            joined([x.c for x in states]), joined([x.w for x in states]), maybe([x.natural for x in states]), relaxed
-        )
-        return Iterate(
-            grid,
-            state,
-            joined([x.lam for x in found]),
-            joined([x.change for x in found]),
-            joined([x.tail for x in found]),
-            joined([x.stable for x in found]),
-            joined([x.ok for x in found]),
-            joined([x.steps for x in found]),
-            maybe([x.hoop for x in found]),
-        )
+        found = self.last
+        assert found is not None
+        for before, went_on in reversed(self.left):
+            before.put(went_on, found)
+            found = before
+        return found
 
 
 Settle = Callable[[Problem, Grid, State, float], Iterate]
 
 
+# Elements of like lengths begin alike, so that few groups are solved apart: with what the longest of a group asks for,
+# whoever is there.
+SPANS = (2.4, 3.1, ritz.LONGEST)
+
+
+def groups(span: Array, tolerance: float) -> tuple[NDArray[np.intp], list[int]]:
+    """The group of elements of so many ``ln(b/a)``, and the modes to begin with of every group."""
+    return np.searchsorted(SPANS[:-1], span), [first_modes(most, tolerance) for most in SPANS]
+
+
 def first_modes(span: float, tolerance: float) -> int:
-    """Modes that bring the truncation error near ``tolerance`` for ``ln(b/a) = span``: a start, not a promise."""
-    return min(FIRST_MODES, max(2, math.ceil(-0.4 - math.log10(tolerance) * (0.25 + 0.12 * span))))
+    """Modes that bring the truncation error near ``tolerance`` for an element of a group: a start, not a promise."""
+    most = next((most for most in SPANS if span <= most), SPANS[-1])
+    return min(FIRST_MODES, max(2, math.ceil(-0.4 - math.log10(tolerance) * (0.25 + 0.12 * most))))
 
 
 def goal(tolerance: float) -> float:
@@ -248,15 +255,24 @@ class Start:
         """The states at ``index``."""
         return Start(self.grid.take(index), self.state.take(index))
 
+    @classmethod
+    def join(cls, parts: Sequence[Start]) -> Start:
+        """Taut states of one resolution together."""
+        if len(parts) == 1:
+            return parts[0]
+        grid = Grid.lay(parts[0].grid.table.modes, np.concatenate([part.grid.breaks for part in parts], axis=1))
+        c, w = ([getattr(part.state, name) for part in parts] for name in ("c", "w"))
+        return cls(grid, State(np.concatenate(c, axis=-1), np.concatenate(w, axis=-1)))
 
-def prolonged(start: Start, problem: Problem, modes: int) -> Start:
-    """The same state with more modes."""
+
+def prolonged(start: Start, modes: int) -> Start:
+    """The same state with more modes, or without the last ones."""
     old = start.grid.table
     grid = Grid.lay(modes, start.grid.breaks)
     m = grid.elements
     c, states = start.state.c, start.state.c.shape[1]
-    added = np.zeros((m, modes - old.modes, states))
-    bubbles = np.concatenate((c[: m * old.modes].reshape(m, old.modes, states), added), axis=1)
+    bubbles = c[: m * old.modes].reshape(m, old.modes, states)[:, :modes]
+    bubbles = np.concatenate((bubbles, np.zeros((m, max(0, modes - old.modes), states))), axis=1)
     c = np.concatenate((bubbles.reshape(-1, states), c[m * old.modes :]))
     carry = ritz.transfer(old.modes, modes)
 
@@ -315,7 +331,7 @@ def refine(
         modes = start.grid.table.modes
         if previous is not None:
             error = estimate(lam, previous, result.change, result.tail, tolerance, factor)
-            if factor > LEVEL_FACTOR:
+            if factor >= SOFT_LEVEL_FACTOR:
                 error = error + SOFT_BEFORE_FACTOR * before
             before = np.abs((lam - previous) / lam)
             settled = np.flatnonzero(ok & (error <= tolerance))
@@ -339,7 +355,7 @@ def refine(
             problem, index, start, lam = problem.take(rest), index[rest], start.take(rest), lam[rest]
             before = before[rest]
         previous = lam
-        start = prolonged(start, problem, next_modes(modes))
+        start = prolonged(start, next_modes(modes))
     return answers, np.concatenate(lost), total
 
 

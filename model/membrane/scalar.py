@@ -558,7 +558,8 @@ def _refine(solver: Solver, tolerance: float, folds: bool, near: Found | None) -
             continue
         if not (solver.stable and lam > 0.0):
             raise NotOrdinary
-        error = refinement.estimate(lam, previous, change, tail, tolerance)
+        factor = refinement.CUT_LEVEL_FACTOR if solver.cones else refinement.LEVEL_FACTOR
+        error = refinement.estimate(lam, previous, change, tail, tolerance, factor)
         if error <= tolerance:
             answer = found(solver, lam, error, steps)
             if not folds or (solver.cones and solver.admissible(tolerance)):

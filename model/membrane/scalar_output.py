@@ -7,7 +7,7 @@ import math
 from math import exp, log1p
 from typing import TYPE_CHECKING
 
-from model.membrane.output import FINE, HOOP, POLISH, WAY, series
+from model.membrane.output import FAR, FINE, HOOP, MORE_OF_WAY, POLISH, WAY, series
 from model.membrane.scalar_state import Cone, Film, Floats, Found, NotOrdinary, Panel, Tables, stress
 
 if TYPE_CHECKING:
@@ -70,9 +70,10 @@ def _softened(solver: Solver, edges: list[Values], inside: list[tuple[Floats, ..
             at = areas.index(widest)
             area, log1, log2 = widest, logs1[at], logs2[at]
     start, softened = film.log_prestretch, 0.0
-    solver.count.mechanical += len(WAY)
-    solver.count.electric += len(WAY)
-    for share in WAY:
+    shares = WAY if area - 2.0 * start <= FAR else WAY + MORE_OF_WAY
+    solver.count.mechanical += len(shares)
+    solver.count.electric += len(shares)
+    for share in shares:
         _, _, h11, _, h22, b = stress(film, start + share * (log1 - start), start + share * (log2 - start))
         twice = 2.0 * b
         if not (h11 + twice > 0.0 and h22 + twice > 0.0):

@@ -15,7 +15,7 @@ from model.material.law import Evaluations, Film, stack, stress
 from model.material.materials import EPSILON_0
 from model.membrane import from_rest, ritz, scalar, tension_field
 from model.membrane.profile import Profile, dense, profile
-from model.membrane.refinement import ROUND_OFF_TENSION, Answer, Start, first_modes, refine
+from model.membrane.refinement import ROUND_OFF_TENSION, Answer, Start, groups, prolonged, refine
 from model.membrane.ritz import LONGEST, Grid, Problem, State
 from model.membrane.scalar_state import Film as OneFilm
 from model.membrane.scalar_state import Found, slack
@@ -253,7 +253,9 @@ def _quick(
     found = None if near is None else scalar.solve(film, tolerance, count, folds=folds, near=near)
     if found is None:
         found = scalar.solve(film, tolerance, count, folds=folds)
-    if found is None or found.softening > SOFTENING or found.meridional <= 0.0:
+    if found is None or found.meridional <= 0.0:
+        return None
+    if found.softening > SOFTENING and not _on_branch(specimen, h, voltage, found, count, tolerance):
         return None
     wrinkled = bool(found.cones) or found.hoop < ROUND_OFF_TENSION * found.meridional
     if wrinkled and slack(film):
@@ -280,6 +282,19 @@ def _quick(
         evaluations=count,
         quick=found,
     )
+
+
+def _on_branch(
+    specimen: Specimen, h: float, voltage: float, found: Found, count: Evaluations, tolerance: float
+) -> bool:
+    """Whether an easy state is plainly on the branch from rest; see `_Block.doubtful`."""
+    with np.errstate(all="ignore"):
+        problem = _Block(_Inputs.gather(specimen, h, voltage), np.zeros(1, dtype=np.intp), count).problem
+        grid, state = found.arrays()
+        lam = np.array([found.lam])
+        if found.cones:
+            return bool(from_rest.clear(problem, Start(grid, state), lam, tolerance)[0])
+        return bool(from_rest.connected(problem, prolonged(Start(grid, state), from_rest.CHECK_MODES), lam)[0])
 
 
 def _solve(
@@ -450,11 +465,11 @@ class _Block:
         answers: list[Answer] = []
         steps = np.zeros(len(index), dtype=np.intp)
         missed = []
-        modes = np.array([first_modes(float(span), tolerance) for span in problem.span / (len(breaks) - 1)])
-        for number in np.unique(modes).tolist():
-            some = np.flatnonzero(modes == number)
+        kind, modes = groups(problem.span / (len(breaks) - 1), tolerance)
+        for one in np.unique(kind).tolist():
+            some = np.flatnonzero(kind == one)
             part = problem if len(some) == len(index) else problem.take(some)
-            grid = Grid.lay(number, breaks[:, some])
+            grid = Grid.lay(modes[one], breaks[:, some])
             start, first = Start(grid, ritz.guess(part, grid)), len(folded)
             found, left, spent = refine(
                 part, tolerance, start, sensitivities=sensitivities, folded=folded if relaxed else None
@@ -467,10 +482,9 @@ class _Block:
             answers += found
         lost = np.concatenate(missed)
         doubtful = [] if relaxed else [lost]
-        for answer in answers:
-            x = answer.extremes
-            soft = (x.softening > SOFTENING) | (x.meridional <= 0.0)
-            wrinkled = x.hoop < ROUND_OFF_TENSION * x.meridional if relaxed else np.zeros_like(soft)
+        none = [np.zeros(len(answer.index), dtype=np.bool_) for answer in answers]
+        folds = [x.hoop < ROUND_OFF_TENSION * x.meridional for x in (a.extremes for a in answers)] if relaxed else none
+        for answer, wrinkled, soft in zip(answers, folds, self.doubtful(index, answers, folds, tolerance), strict=True):
             doubtful.append(answer.index[soft & ~wrinkled])
             if wrinkled.any():
                 folded.append((answer.index[wrinkled], Start(answer.grid, answer.state).take(wrinkled)))
@@ -483,8 +497,9 @@ class _Block:
                 )
                 steps[some] += spent
                 for answer in answers:
-                    soft = answer.extremes.softening > SOFTENING
                     answer.index = some[answer.index]
+                none = [np.zeros(len(answer.index), dtype=np.bool_) for answer in answers]
+                for answer, soft in zip(answers, self.doubtful(index, answers, none, tolerance), strict=True):
                     doubtful.append(answer.index[soft])
                     self.place(result, index, answer, ~soft)
                 return some[lost]
@@ -496,6 +511,39 @@ class _Block:
         if len(some):
             self.follow(result, index, problem, some, steps, tolerance, relaxed, sensitivities)
         result.whole["iterations"][self.index[index]] = steps
+
+    def doubtful(
+        self,
+        index: NDArray[np.intp],
+        answers: list[Answer],
+        others: list[NDArray[np.bool_]],
+        tolerance: float,
+    ) -> list[NDArray[np.bool_]]:
+        """Which answers may not be on the branch from rest; ``others`` are not asked about."""
+        soft: list[NDArray[np.bool_]] = []
+        taut: list[tuple[NDArray[np.bool_], NDArray[np.intp], Answer]] = []
+        for answer, other in zip(answers, others, strict=True):
+            x = answer.extremes
+            these = (x.softening > SOFTENING) | (x.meridional <= 0.0)
+            soft.append(these)
+            asked = np.flatnonzero(these & (x.meridional > 0.0) & ~other)
+            if len(asked) == 0:
+                continue
+            part = answer.take(asked)
+            if part.state.relaxed is None:
+                taut.append((these, asked, part))
+            else:
+                problem = self.problem.take(index[part.index])
+                these[asked] = ~from_rest.clear(problem, Start(part.grid, part.state), part.lam, tolerance)
+        if taut:
+            end = Start.join([prolonged(Start(part.grid, part.state), from_rest.CHECK_MODES) for _, _, part in taut])
+            which = np.concatenate([part.index for _, _, part in taut])
+            lam = np.concatenate([part.lam for _, _, part in taut])
+            good = from_rest.connected(self.problem.take(index[which]), end, lam)
+            for these, asked, _ in taut:
+                these[asked] = ~good[: len(asked)]
+                good = good[len(asked) :]
+        return soft
 
     def follow(
         self,

@@ -31,6 +31,7 @@ START_MODES = 5
 MOST_ZONES = 5
 ROUNDS = 4
 SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a wrong sign, as it has beside a cut
+THIN = 1e-3  # of `wrong_sign`: beyond it a zone is there
 STEPS, CAREFUL_STEPS = 15, 40  # most of a rung
 CALM = 1e-4  # change of the strains from which a careful solution moves its cuts
 CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
@@ -131,6 +132,17 @@ def zones(grid: Grid, state: State, at: Points, slack: float = 0.0, *, between: 
     x = left + share[place] * (right - left)
     where[rank, columns] = x[0] + part * (x[1] - x[0])
     return Zones(changes, folded[0], where)
+
+
+def complete(problem: Problem, grid: Grid, state: State, tolerance: float) -> NDArray[np.bool_]:
+    """Whether states with cuts have no zone that is still so thin that `wrong_sign` lets it pass.
+
+    Where the tension is a small rest such a zone changes the force by more than its third power.
+    """
+    assert state.relaxed is not None
+    now = zones(grid, state, ritz.evaluate(problem, grid, state), slack=THIN * wrong_sign(tolerance))
+    kinds = state.relaxed[0]
+    return np.asarray((now.changes == (kinds[1:] != kinds[:-1]).sum(axis=0)) & (now.first == kinds[0]))
 
 
 def remap(old: Grid, state: State, natural: Array, breaks: Array, modes: int, wrinkled: NDArray[np.bool_]) -> Start:
@@ -317,7 +329,7 @@ def _round(
     """Cut the elements where the zones of ``start`` end, and solve; other zones than before: once more (``again``)."""
     here = problem.take(index)
     settler = partial(settle, kind=SoftCones, careful=True) if careful else settle
-    factor = refinement.SOFT_LEVEL_FACTOR if careful else refinement.LEVEL_FACTOR
+    factor = refinement.SOFT_LEVEL_FACTOR if careful else refinement.CUT_LEVEL_FACTOR
     state = start.state
     mixed: NDArray[np.bool_] = np.zeros(len(index), dtype=np.bool_)
     if state.relaxed is not None:
@@ -380,10 +392,13 @@ def _alike(film: Problem, edges: Array, tolerance: float) -> list[_Alike]:
     ends = np.concatenate((-film.span[None], edges, np.zeros((1, len(film.span)))))
     length = ends[1:] - ends[:-1]
     pieces = np.maximum(1, np.ceil(length / ritz.LONGEST)).astype(np.intp)
-    longest = (length / pieces).max(axis=0)
-    modes = [max(3, refinement.first_modes(float(one), tolerance)) for one in longest]
-    rows, group = np.unique(np.vstack((pieces, modes)), axis=1, return_inverse=True)
+    kind, modes = refinement.groups((length / pieces).max(axis=0), tolerance)
+    key = np.vstack((pieces, kind))
+    if (key == key[:, :1]).all():
+        rows, group = key[:, :1], np.zeros(key.shape[1], dtype=np.intp)
+    else:
+        rows, group = np.unique(key, axis=1, return_inverse=True)
     return [
-        _Alike(np.flatnonzero(group.ravel() == k), tuple(row[:-1].tolist()), int(row[-1]))
+        _Alike(np.flatnonzero(group.ravel() == k), tuple(row[:-1].tolist()), max(3, modes[row[-1]]))
         for k, row in enumerate(rows.T)
     ]
