@@ -36,6 +36,7 @@ from rig.safety.guard import GIVE_BACK, SAFE_VOLTAGE, AnyGuard, Guard, GuardStat
 from rig.safety.limits import FilmLimits, Limit, Limits
 from rig.steps.base import Action, Result, Turns, write_phase
 from rig.steps.output import choose_about_live_output, confirm_voltage
+from rig.steps.regain import regain_duration
 from rig.steps.rig import Rig
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ class Engine:
         self._began = 0.0
         self._doing_now: Action | None = None
         self._doing = ""
+        self._paused = False
 
     @property
     def guard(self) -> AnyGuard | None:
@@ -375,10 +377,12 @@ class Engine:
         self.rig.event("operator", f"paused by {self.control.pausing} during {self._doing}")
         words = "the operator's pause"
         write_phase(self.rig, action, "pause", words, direction=action.direction, cycle=action.cycle, voltage=0.0)
+        self._paused = True
         with closing(pause(self.rig, action)) as turns:
             for _ in turns:
                 self._show_now_and_then(done, total, f"paused: {self._doing}")
                 self._turn()
+        self._paused = False
 
     def _take_turns(self, turns: Turns) -> None:
         with closing(turns):
@@ -398,9 +402,13 @@ class Engine:
         action = self._doing_now
         if self._show_status is None or action is None:
             return
-        elapsed = 0.0 if self.control.pausing else self.clock.now() - self._began
         try:
-            self._show_status(self._outlook.look(self._number, action, elapsed, label))
+            elapsed = self.clock.now() - self._began
+            if self._paused:  # its time has not begun: first the way back to where it begins
+                elapsed = -regain_duration(self.rig, action)
+            status = self._outlook.look(self._number, action, elapsed, label)
+            self.control.left = status.left
+            self._show_status(status)
         except Exception as error:
             self._show_status = None
             self.recorder.event("warning", "engine", f"the status line failed: {error!r}")

@@ -8,6 +8,7 @@ for input.
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import sys
@@ -87,6 +88,8 @@ class Control(StopRequest):
         The answer to it, once given.
     doing : str
         What the run is doing, for whoever asks from another terminal.
+    left : float
+        Seconds that it still takes, by the plan; NaN while that is not known.
     """
 
     def __init__(
@@ -101,6 +104,7 @@ class Control(StopRequest):
         self.question: Question | None = None
         self.answer: Answer | None = None
         self.doing = ""
+        self.left = math.nan
         self._sources = tuple(sources)
         self._say = say
         self._next_look = 0.0
@@ -176,6 +180,7 @@ class Control(StopRequest):
             "doing": self.doing,
             "question": question.shown if question is not None else "",
             "expected": question.expected if question is not None else "",
+            "left_s": f"{self.left:.1f}" if math.isfinite(self.left) else "",
         }
 
     def close(self) -> None:

@@ -346,14 +346,9 @@ class RunView:
         return found
 
     def _time_left(self) -> float | None:
-        """By the plan's durations: what is left of this part and all that come after it."""
-        steps = (self._outlook or {}).get("steps")
-        if not steps or not self._phases or self._follower.ended:
-            return None
-        now = min(len(self._phases), len(steps)) - 1
-        in_part = max(steps[now]["duration_s"] - (self._t - self._phases[-1]["t_s"]), 0.0)
-        left: float = in_part + sum(step["duration_s"] for step in steps[now + 1 :])
-        return round(left, 1)
+        """What the run says; there is no other estimate than its own."""
+        said = self._said.get("left_s", "")
+        return float(said) if said else None
 
     def send(self, text: str) -> str:
         """Say a word to the run (stop, pause, continue, or an answer) and give back what it says.

@@ -30,6 +30,17 @@ class Regain(Step):
             yield voltage_to(self, state, scene, self.voltage, SETTLE_S)
 
 
+def regain_duration(rig: Rig, action: Action) -> float:
+    """How long (s) `regain` would probably take from where the rig is now."""
+    seconds, voltage = 0.0, action.voltage[0]
+    if voltage > 0 and (action.voltage[1] > 0 or action.moves):
+        now = 0.0 if rig.recorder.hv is None else rig.recorder.hv.voltage
+        seconds += ramp_duration(rig.scene, now, voltage)
+    if action.moves and not action.begins_anywhere:
+        seconds += abs(action.h[0] - rig.recorder.displacement) / action.speed
+    return seconds
+
+
 def regain(rig: Rig, action: Action) -> Turns:
     """After a pause: voltage and displacement with which ``action`` begins, so that it can be carried out anew."""
     voltage = action.voltage[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -24,26 +25,30 @@ pytestmark = pytest.mark.slow  # the whole protocol of the paper
 FIXTURES = Path(str(files("sim_fixtures")))
 
 
-@pytest.fixture(scope="module")
-def looks() -> list[tuple[float, Status, float, float]]:
+def run(pause_at: float = math.inf, pause_s: float = 0.0) -> list[tuple[float, Status, float, float]]:
     """Clock time, status, and the true force (N) and voltage (V) then; the end of the run last."""
     experiment = prepare(FIXTURES / "scenes" / "cone-4mm.toml", FIXTURES / "protocols" / "paper.toml")
     bench = open_bench(experiment.scene)
     assert bench.simulated is not None
     world = bench.simulated.world
     found: list[tuple[float, Status, float, float]] = []
+    control = Control(unattended="a test")
 
     def show(status: Status) -> None:
         now = bench.clock.now()
         volts = float(world.voltage(np.array([now]))[0])
         found.append((now, status, float(world.force(np.array([now]))[0]), volts))
+        if pause_at <= now < pause_at + 0.25:
+            control.ask_pause("a test")
+        elif now > pause_at + pause_s:
+            control.pausing = ""
 
     engine = Engine(
         bench,
         experiment.actions,
         cast(LogWriter, NoLog()),
         gains_of(experiment.certificates),
-        Control(unattended="a test"),
+        control,
         lambda done, total, label: None,
         experiment.certificates,
         requested="a test",
@@ -52,6 +57,11 @@ def looks() -> list[tuple[float, Status, float, float]]:
     outcome, error = engine.run()
     assert error is None and outcome.safe
     return found
+
+
+@pytest.fixture(scope="module")
+def looks() -> list[tuple[float, Status, float, float]]:
+    return run()
 
 
 def test_the_numbers_are_those_of_the_hardware(looks: list[tuple[float, Status, float, float]]) -> None:
@@ -76,6 +86,17 @@ def test_the_time_left_is_within_15_percent_from_a_tenth_of_the_run_on(
     end = looks[-1][0]
     for now, status, _, _ in looks:
         if 0.1 * end < now < 0.97 * end:
+            assert status.left == pytest.approx(end - now, rel=0.15, abs=3.0), f"{now:.1f} of {end:.1f} s"
+
+
+@pytest.mark.long
+def test_a_pause_is_not_counted_and_what_is_done_anew_is() -> None:
+    paused = run(pause_at=70.0, pause_s=30.0)
+    end = paused[-1][0]
+    resting = [status.left for now, status, _, _ in paused if 80.0 < now < 99.0]
+    assert max(resting) - min(resting) < 0.1  # the time left stands still
+    for now, status, _, _ in paused:
+        if 100.0 < now < 0.97 * end:
             assert status.left == pytest.approx(end - now, rel=0.15, abs=3.0), f"{now:.1f} of {end:.1f} s"
 
 
