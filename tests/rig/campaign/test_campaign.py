@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
+import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -196,3 +199,48 @@ def test_a_folder_without_logs_has_everything_waiting(place: Path) -> None:
     assert done.exit_code == 0 and "3 waiting" in done.output
     with pytest.raises(ConfigError):
         load_campaign(place / "nothing.toml")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")
+@pytest.mark.parametrize(
+    "times",
+    [
+        pytest.param(4, marks=pytest.mark.slow),
+        pytest.param(200, marks=[pytest.mark.long, pytest.mark.timeout(7200)]),
+    ],
+)
+def test_killed_at_random_instants_it_goes_on_at_the_right_specimen_and_step(place: Path, times: int) -> None:
+    """Of two specimens, killed at any instant; then resumed: each is complete once, from the step where it was."""
+    (place / "breakdown.toml").write_text(LONG)
+    file, rng = place / "campaign.toml", random.Random(5)
+    file.write_text(CAMPAIGN + film("one", 70.0, "A") + film("two", 70.0, "A"))
+    command = [sys.executable, "-m", "rig", "campaign", "run", str(file), "--yes"]
+    began = time.monotonic()
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    lasts = time.monotonic() - began
+    killed = 0
+    for _ in range(times):
+        shutil.rmtree(place / "logs", ignore_errors=True)
+        running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            running.wait(rng.uniform(0.3, 1.0) * lasts)
+        running.kill()
+        running.wait()
+        before = standings(place)
+        parts = list(place.glob("logs/*.part"))
+        killed += bool(parts)
+        reached = [max((m.fields["step"] for m in read_log(part).messages("/phase")), default=0) for part in parts]
+        assert say("resume", file, "--yes").exit_code == 0
+        assert set(standings(place).values()) == {Standing.DONE}
+        for name, was in before.items():
+            complete = [one for one in place.glob(f"logs/{name}*.mcap") if is_complete(one)]
+            assert len(complete) == 1, (name, was, complete)
+        for part, step in zip(parts, reached, strict=True):
+            rest = part.with_name(part.name.replace(".mcap.part", ".2.mcap"))
+            begun = read_log(rest).metadata.get("resumed", {}).get("at_step")
+            assert begun == (str(step) if step else begun), (part, step, begun)
+    assert killed > 0.3 * times
+
+
+def is_complete(log: Path) -> bool:
+    return (read_log(log).outcome or {}).get("status") == "complete"
