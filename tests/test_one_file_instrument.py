@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.protocols import TO_THE_FILM
+
 HERE = Path(__file__).parent
 FIXTURES = Path(str(files("sim_fixtures")))
 ENTRY_POINTS = """[dea_rig.instruments]
@@ -20,18 +22,9 @@ acme-scale = acme_scale
 [dea_rig.twins]
 acme-scale = acme_scale_twin
 """
-SHORT = """
-[[step]]
-do = "home"
-[[step]]
-do = "zero"
-duration_s = 0.5
-[[step]]
-do = "approach"
-speed_mm_per_s = 4.0
-threshold_mN = 8.0
-max_travel_mm = 8.0
-[[step]]
+SHORT = (
+    TO_THE_FILM
+    + """[[step]]
 do = "sweep"
 displacement_mm = 3.0
 speed_mm_per_s = 4.0
@@ -39,6 +32,7 @@ speed_mm_per_s = 4.0
 do = "return"
 speed_mm_per_s = 4.0
 """
+)
 
 
 class Place:

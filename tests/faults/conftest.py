@@ -26,6 +26,7 @@ from rig.protocol.protocol import Protocol
 from rig.run.backend import open_bench
 from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
+from tests.protocols import TO_THE_FILM
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 # The film of the scenes, so near that the way to it is short.
@@ -33,18 +34,9 @@ NEARER = {
     "approach_from_mm = 36.0": "approach_from_mm = 13.0",
     "contact_position_mm = 40.0": "contact_position_mm = 17.0",
 }
-PROTOCOL = """
-[[step]]
-do = "home"
-[[step]]
-do = "zero"
-duration_s = 0.5
-[[step]]
-do = "approach"
-speed_mm_per_s = 4.0
-threshold_mN = 8.0
-max_travel_mm = 8.0
-[[step]]
+PROTOCOL = (
+    TO_THE_FILM
+    + """[[step]]
 do = "voltage"
 voltage_V = 1000
 settle_s = 0.5
@@ -59,6 +51,7 @@ duration_s = 2.0
 do = "return"
 speed_mm_per_s = 4.0
 """
+)
 
 
 @dataclass

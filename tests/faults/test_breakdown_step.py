@@ -10,24 +10,17 @@ import pytest
 from rig.base.errors import LimitError
 from rig.log.reader import read_log
 from rig.sim.truth import Fault
+from tests.protocols import TO_THE_FILM
 
 Tell = Callable[..., Any]  # of conftest.Story
-HEAD = """
-[[step]]
-do = "home"
-[[step]]
-do = "zero"
-duration_s = 0.5
-[[step]]
-do = "approach"
-speed_mm_per_s = 4.0
-threshold_mN = 8.0
-max_travel_mm = 8.0
-[[step]]
+HEAD = (
+    TO_THE_FILM
+    + """[[step]]
 do = "ramp"
 displacement_mm = 3.0
 speed_mm_per_s = 4.0
 """
+)
 TEST = HEAD + '[[step]]\ndo = "breakdown"\nceiling_V = 1700\n'
 AFTER = '[[step]]\ndo = "ramp"\ndisplacement_mm = 2.0\nspeed_mm_per_s = 4.0\n'
 WEAK = ("[simulation.film]", "[simulation.film]\nbreakdown_field_MV_per_m = 40.0")

@@ -27,22 +27,12 @@ from rig.safety.limits import Limits, check_zero
 from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.truth import Fault
+from tests.protocols import TO_THE_FILM
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 Tell = Callable[..., Any]  # of conftest.Story
 CONTACT_MM = 17.0
-HEAD = """
-[[step]]
-do = "home"
-[[step]]
-do = "zero"
-duration_s = 0.5
-[[step]]
-do = "approach"
-speed_mm_per_s = 4.0
-threshold_mN = 8.0
-max_travel_mm = 8.0
-"""
+HEAD = TO_THE_FILM
 MOVE_INTO_THE_FIELD_LIMIT = (
     HEAD
     + """

@@ -24,20 +24,12 @@ from drivers.instruments.ascii_stream import (
 from drivers.links.link import DeviceRefused, DeviceSilent
 from drivers.roles import OK, SampleFlag
 from rig.cli.app import main
+from tests.protocols import TO_THE_FILM
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
-PASSIVE = """
-[[step]]
-do = "home"
-[[step]]
-do = "zero"
-duration_s = 0.5
-[[step]]
-do = "approach"
-speed_mm_per_s = 4.0
-threshold_mN = 8.0
-max_travel_mm = 8.0
-[[step]]
+PASSIVE = (
+    TO_THE_FILM
+    + """[[step]]
 do = "sweep"
 displacement_mm = 3.0
 speed_mm_per_s = 4.0
@@ -45,6 +37,7 @@ speed_mm_per_s = 4.0
 do = "return"
 speed_mm_per_s = 4.0
 """
+)
 
 
 class FakePort:

@@ -10,20 +10,12 @@ import pytest
 from click.testing import CliRunner
 
 from rig.cli.app import main
+from tests.protocols import TO_THE_FILM
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
-PROTOCOL = """
-[[step]]
-do = "home"
-[[step]]
-do = "zero"
-duration_s = 0.5
-[[step]]
-do = "approach"
-speed_mm_per_s = 4.0
-threshold_mN = 8.0
-max_travel_mm = 8.0
-[[step]]
+PROTOCOL = (
+    TO_THE_FILM
+    + """[[step]]
 do = "ramp"
 displacement_mm = 3.0
 speed_mm_per_s = 4.0
@@ -32,6 +24,7 @@ do = "breakdown"
 ceiling_V = 1200
 rate_V_per_s = 200
 """
+)
 STRENGTHS = {"weak": 34.0, "middle": 38.0, "strong": 41.0, "unbroken": 70.0}  # V/um; the ceiling is at about 47
 
 

@@ -25,20 +25,10 @@ from rig.campaign.progress import Standing, progress_of
 from rig.cli.app import main
 from rig.log.catalogue import INDEX
 from rig.log.reader import read_log
+from tests.protocols import TO_THE_FILM
 
 FIXTURES = Path(str(files("sim_fixtures")))
-HEAD = """
-[[step]]
-do = "home"
-[[step]]
-do = "zero"
-duration_s = 0.5
-[[step]]
-do = "approach"
-speed_mm_per_s = 4.0
-threshold_mN = 8.0
-max_travel_mm = 8.0
-"""
+HEAD = TO_THE_FILM
 BREAKDOWN = HEAD + '[[step]]\ndo = "breakdown"\nceiling_V = 1200\n'
 LONG = HEAD + "".join(f'[[step]]\ndo = "hold"\nduration_s = {n}\n' for n in (1, 2, 3))
 CAMPAIGN = """

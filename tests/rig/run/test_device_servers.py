@@ -22,6 +22,8 @@ import pytest
 import serial
 from serial.rfc2217 import PortManager
 
+from tests.protocols import TO_THE_FILM
+
 FIXTURES = Path(str(files("sim_fixtures")))
 pytestmark = [pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX"), pytest.mark.slow]
 
@@ -37,18 +39,9 @@ CHANGES = {
     "../calibrations": str(FIXTURES / "calibrations"),
 }
 
-PASSIVE = """
-[[step]]
-do = "home"
-[[step]]
-do = "zero"
-duration_s = 0.5
-[[step]]
-do = "approach"
-speed_mm_per_s = 4.0
-threshold_mN = 8.0
-max_travel_mm = 8.0
-[[step]]
+PASSIVE = (
+    TO_THE_FILM
+    + """[[step]]
 do = "sweep"
 displacement_mm = 3.0
 speed_mm_per_s = 4.0
@@ -56,6 +49,7 @@ speed_mm_per_s = 4.0
 do = "return"
 speed_mm_per_s = 4.0
 """
+)
 
 
 class Pty(serial.Serial):
