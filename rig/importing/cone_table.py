@@ -15,7 +15,7 @@ from model.membrane.solve import solve
 from model.specimen import Specimen
 from rig.importing.branches import Leg, jumps_of, legs_of, noise_of, repeated_rows, steps_of
 from rig.importing.columns import Chooser, Chosen, Part, read_columns
-from rig.importing.findings import Finding, refuse
+from rig.importing.findings import Finding, Findings, refuse
 from rig.importing.options import ImportOptions
 from rig.importing.source import Piece, Source, open_source
 from rig.importing.table import LeftOut
@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 WANTED = ("displacement", "force", "voltage")
 IMPLAUSIBLE = 20.0  # factor between the measured force and that of the cone as believed
 LEAST_VOLTAGE = 50.0  # V; less bends no film
+NO_REST = 0.1  # of the largest displacement or force: what begins at more does not begin at zero
+MOST_FIELD = 1e9  # V/m, of the undeformed film; elastomers break down at a tenth of it
 LEVEL_V, LEVEL_PART = 20.0, 0.02  # by which voltages of one level may differ
 ALLOWED_V, ALLOWED_PART = 50.0, 0.05  # by which a sample of a sweep may be off its level
 SWEEPS_DIFFER = 0.05  # of the largest force: sweeps at one voltage that differ by more are not of one state
@@ -108,7 +110,8 @@ def _curves_of(source: Source, specimen: Specimen) -> tuple[list[Curve], list[di
         if not _usable(name, part, source, specimen):
             continue
         sweeps = _sweeps(name, part, source)
-        found = [_curve(name, k, sweep, part, specimen) for k, sweep in enumerate(sweeps)]
+        noise = _noises(part)
+        found = [_curve(name, k, sweep, part, specimen, noise) for k, sweep in enumerate(sweeps)]
         found = _with_known_voltage(name, found, part, sweeps, source)
         used = (
             np.sort(np.concatenate([sweep.rows for sweep, curve in zip(sweeps, found, strict=False)]))
@@ -228,6 +231,10 @@ def _turned(part: Part, source: Source, *, first: bool) -> Part:
     ):
         values["force"] = -force
         turned.append("force")
+    if "voltage" not in options.sign and values["voltage"].min() < -LEVEL_V:
+        values["voltage"] = np.abs(values["voltage"])
+        if first:
+            source.findings.note("sign", "the voltage is negative; its size is used, for the force goes by its square")
     for quantity in turned:
         if first:
             source.findings.note(
@@ -291,7 +298,37 @@ def _usable(name: str, part: Part, source: Source, specimen: Specimen) -> bool:
             f"{name}: the highest voltage is {largest:.4g} V, which bends no film: is the unit kV",
             "--unit voltage=kV",
         )
+    _at_rest(name, h, force, findings)
+    field = largest / specimen.thickness
+    if field > MOST_FIELD:
+        findings.obstacle(
+            "implausible",
+            f"{name}: the highest voltage is {largest:.4g} V, {1e-6 * field:.3g} V/um across this film before it is "
+            "stretched, which no film stands: check the unit",
+            "--unit voltage=V",
+            line=source.understood.unit_line or source.understood.heading_line,
+        )
     return len(findings.of("obstacle")) == before
+
+
+def _at_rest(name: str, h: Array, force: Array, findings: Findings) -> None:
+    """Tell of displacement and force that do not begin at zero."""
+    far, low = float(h.max()), float(h.min())
+    if low > NO_REST * far:
+        findings.warning(
+            "zero",
+            f"{name}: the displacement begins at {1e3 * low:.4g} mm; it has to be counted from where the disk touches "
+            "the film",
+            "--zero displacement=first",
+        )
+        return
+    rest = float(np.median(force[h < low + 0.02 * (far - low)]))
+    if abs(rest) > NO_REST * float(np.abs(force).max()):
+        findings.warning(
+            "zero",
+            f"{name}: the force is {rest:.3g} N where the displacement begins: was it set to zero",
+            "--zero force=first",
+        )
 
 
 def _against_the_cone(name: str, h: Array, force: Array, specimen: Specimen, source: Source) -> None:
@@ -520,11 +557,17 @@ def _difference(one: Curve, other: Curve) -> float:
     return float(np.abs(np.interp(grid, one.h[a][mine], one.force[a][mine]) - np.interp(grid, x, y)).max())
 
 
-def _curve(name: str, number: int, sweep: Sweep, part: Part, specimen: Specimen) -> Curve:
+def _noises(part: Part) -> tuple[float, float]:
+    """Standard deviation of one sample of force (N) and displacement (m): scatter, or what the digits leave open."""
+    h, force = part.values["displacement"], part.values["force"]
+    least = 1e-9 * float(np.abs(force).max())
+    return max(noise_of(force), 0.3 * _resolution(force), least), max(noise_of(h), 0.3 * _resolution(h))
+
+
+def _curve(name: str, number: int, sweep: Sweep, part: Part, specimen: Specimen, noise: tuple[float, float]) -> Curve:
     values, rows = part.values, sweep.rows
     h, force = values["displacement"], values["force"]
     label = f"{name}, sweep {number + 1}, {sweep.voltage:g} V"
-    resolution = _resolution(force)
     return Curve(
         label=label,
         run=name,
@@ -534,8 +577,8 @@ def _curve(name: str, number: int, sweep: Sweep, part: Part, specimen: Specimen)
         voltage=values["voltage"][rows],
         nominal_voltage=sweep.voltage,
         direction=sweep.direction,
-        force_noise=max(noise_of(force), 0.3 * resolution, 1e-9 * float(np.abs(force).max())),
-        displacement_noise=max(noise_of(h), 0.3 * _resolution(h)),
+        force_noise=noise[0],
+        displacement_noise=noise[1],
         force_gain=FORCE_GAIN,
         force_zero=FORCE_ZERO * float(np.abs(force).max()),
         displacement_zero=DISPLACEMENT_ZERO,

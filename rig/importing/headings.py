@@ -54,8 +54,13 @@ VOCABULARY: tuple[tuple[str, str], ...] = (
         r"\b(true|log|logarithmic|natural|wahre?|logarithmische|vraie|logarithmique)\b.*(strain|"
         r"dehnung|deformation|elongation)",
     ),
+    (
+        "true strain",
+        r"(strain|dehnung|deformation|elongation|\beps(ilon)?)\b.*\b(true|log|ln|logarithmic|natural|wahr|vraie)\b",
+    ),
     ("true strain", r"hencky|umformgrad|\bln (l|lambda)"),
     ("true stress", r"\b(true|cauchy|wahre?|vraie)\b.*(stress|spannung|contrainte|sigma)|cauchy"),
+    ("true stress", r"(stress|spannung|contrainte|sigma)\b.*\b(true|wahr|vraie)\b"),
     (
         "stretch",
         r"\bstretch|lambda|(extension|elongation|draw|stretch) ratio|streck(ung|verhaltnis|grad)|verstreckung|"

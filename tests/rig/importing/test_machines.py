@@ -388,3 +388,34 @@ def test_what_cannot_be_read_is_refused_with_the_way_out(tmp_path: Path, text: s
     with pytest.raises(ImportRefused) as refused:
         read_sheet_tests([tmp_path / "uniaxial.csv"])
     assert words in str(refused.value) and "Option: --" in str(refused.value)
+
+
+@pytest.mark.parametrize("heading", ["λ;σ_true [kPa]", "stretch;stress (true) [kPa]", "Stretch;Spannung, wahr [kPa]"])
+def test_true_stress_is_known_wherever_the_word_stands(tmp_path: Path, heading: str) -> None:
+    (tmp_path / "uniaxial.csv").write_text(heading + "\n" + rows(STRETCH, KPA * STRETCH, separator=";"), "utf-8")
+    (test,) = read_sheet_tests([tmp_path / "uniaxial.csv"]).tests
+    np.testing.assert_allclose(test.stress1, STRESS, rtol=1e-5, atol=1.0)
+
+
+def rig(folder: Path, *columns: Array, heading: str = "t_s,h_mm,F_N,U_V") -> Path:
+    path = folder / "rig.csv"
+    path.write_text(heading + "\n" + lines("{:.2f},{:.6f},{:.6f},{:.1f}", *columns))
+    return path
+
+
+def test_a_negative_supply_is_read_by_the_size_of_its_voltage(tmp_path: Path) -> None:
+    check(read_cone_tables([rig(tmp_path, T, MM, F, -V)], FILM).curves, timed=True)
+
+
+def test_what_does_not_begin_at_zero_is_told(tmp_path: Path) -> None:
+    for h, force, word in ((MM + 5.0, F, "--zero displacement=first"), (MM, F + 0.05, "--zero force=first")):
+        found = read_cone_tables([rig(tmp_path, T, h, force, V)], FILM)
+        assert any(word in line for line in found.understood[0].lines())
+    assert not any(
+        "--zero" in line for line in read_cone_tables([rig(tmp_path, T, MM, F, V)], FILM).understood[0].lines()
+    )
+
+
+def test_a_voltage_that_no_film_stands_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ImportRefused, match="which no film stands"):
+        read_cone_tables([rig(tmp_path, T, MM, F, V, heading="t_s,h_mm,F_N,U_kV")], FILM)
