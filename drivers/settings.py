@@ -74,6 +74,15 @@ class InstrumentSettings(Table):
         return float(getattr(self, self.rate_key))
 
     @property
+    def shared_place(self) -> tuple[object, ...] | None:
+        """Sensors with the same one get one connection between them, by `open_shared`; None: each has its own."""
+        return None
+
+    def open_shared(self, names: Sequence[str]) -> Sequence[ByteLink]:
+        """As `open`, one link for each of the instruments called ``names``, over one connection."""
+        raise NotImplementedError
+
+    @property
     def two_may_hold(self) -> bool:
         """Whether two processes may have the link at once: one opens it, and the other adopts it or opens it too."""
         return hasattr(socket, "send_fds")

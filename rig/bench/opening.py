@@ -39,9 +39,14 @@ def open_ports(scene: Scene, clock: RealClock) -> Opened:
     """
     opened = Opened(clock)
     try:
-        for role, table in scene.instruments.items():
-            if table is not scene.hv:
+        tables = {role: table for role, table in scene.instruments.items() if table is not scene.hv}
+        for role, table in tables.items():
+            place = table.shared_place
+            together = [other for other, one in tables.items() if place is not None and one.shared_place == place]
+            if len(together) < 2:
                 opened.links[role] = table.open(role)
+            elif role == together[0]:
+                opened.links.update(zip(together, table.open_shared(together), strict=True))
     except BaseException:
         opened.close()
         raise

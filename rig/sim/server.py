@@ -89,14 +89,19 @@ class _Port:
 
 
 class _TcpPort:
-    """A TCP port on this machine only. One host is served at a time; the next is taken when it has left."""
+    """A TCP port on this machine only. One host is served at a time; the next is taken when it has left.
 
-    def __init__(self, line: _Line, wire: TcpWire) -> None:
+    ``beside`` is the first port of a device that several instruments are on: they have one number, and whichever is
+    free takes the next host. One that ``refuses`` closes what comes while the others are taken.
+    """
+
+    def __init__(self, line: _Line, wire: TcpWire, beside: _TcpPort | None = None, refuses: bool = False) -> None:
         self.line = line
         self.wire = wire
+        self.refuses = refuses
         self.lost_bytes = 0
         self.stalled = False  # as `_Port` has it
-        self._listening = socket.create_server(("127.0.0.1", 0), backlog=2)
+        self._listening = socket.create_server(("127.0.0.1", 0), backlog=2) if beside is None else beside._listening
         self._listening.setblocking(False)
         self.number = int(self._listening.getsockname()[1])
         self._host: socket.socket | None = None
@@ -116,7 +121,11 @@ class _TcpPort:
     def read(self) -> bytes:
         if self._host is None:
             with contextlib.suppress(OSError):
-                self._host, _ = self._listening.accept()
+                host, _ = self._listening.accept()
+                if self.refuses:
+                    host.close()
+                    return b""
+                self._host = host
                 self._host.setblocking(False)
                 self._host.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return b""
@@ -186,10 +195,20 @@ class Server:
             for role in bench.instruments:
                 wire = bench.wire(role)
                 line: _Line = SlcanAdapter(wire) if isinstance(wire, FrameWire) else _Serial(wire)
-                self._ports[role] = _TcpPort(line, wire) if isinstance(wire, TcpWire) else _Port(line, wire)
+                self._ports[role] = self._tcp_port(role, line, wire) if isinstance(wire, TcpWire) else _Port(line, wire)
         except BaseException:
             self.close()
             raise
+
+    def _tcp_port(self, role: str, line: _Line, wire: TcpWire) -> _TcpPort:
+        box = getattr(self._bench.instruments[role], "box", None)
+        beside = [
+            port
+            for other, port in self._ports.items()
+            if box is not None and getattr(self._bench.instruments[other], "box", None) is box
+        ]
+        first = next((port for port in beside if isinstance(port, _TcpPort)), None)
+        return _TcpPort(line, wire, first, refuses=box is not None and len(beside) >= box.connections)
 
     @property
     def ports(self) -> Mapping[str, dict[str, str | int]]:
@@ -221,7 +240,8 @@ class Server:
             look()
             for port in self._ports.values():
                 self._hand_over(port, now)
-            open_ports = {port.master: port for port in self._ports.values() if port.is_open and not port.stalled}
+            ports = sorted(self._ports.values(), key=_comes_last)  # of those on one descriptor the last one takes it
+            open_ports = {port.master: port for port in ports if port.is_open and not port.stalled}
             wait = min(max(self._bench.next_time() - now, STEP_S), IDLE_S)
             ready, _, _ = select.select(list(open_ports), [], [], wait)
             if ready:
@@ -253,6 +273,10 @@ class Server:
         """Close all ports; hosts see them vanish."""
         for port in self._ports.values():
             port.close()
+
+
+def _comes_last(port: _Port | _TcpPort) -> bool:
+    return not (isinstance(port, _TcpPort) and port.refuses)
 
 
 def _place(port: _Port | _TcpPort) -> dict[str, str | int]:

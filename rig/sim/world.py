@@ -74,6 +74,7 @@ class World:
         self.compliance = rig.rig_compliance_um_per_N * 1e-6
         self._screw_error = stage.screw_error_um * 1e-6
         self._screw_wave = 2 * math.pi / (stage.screw_pitch_mm * 1e-3)
+        self.devices: dict[tuple[object, ...], object] = {}  # those that several instruments are on
         self.stage = Path(stage.start_position_mm * 1e-3)
         self.output = Path(0.0 if output is None else output.start_live_V)
         self.torn = False

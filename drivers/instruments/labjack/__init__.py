@@ -6,6 +6,7 @@ Whatever they say, a small step proves gain and monitor before the output is use
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import ClassVar, Literal, Self
 
@@ -15,6 +16,8 @@ from drivers.instrument import Instrument
 from drivers.instruments.labjack.amplifier import Amplifier, LabJackAmplifier
 from drivers.instruments.labjack.analog_input import AnalogDisplacement, AnalogForce
 from drivers.instruments.labjack.codec import LONGEST
+from drivers.instruments.labjack.shared import shared
+from drivers.links.link import ByteLink
 from drivers.recorded import Dialect, Exchange
 from drivers.settings import ForceSettings, Positive, SupplySettings, TcpSettings
 
@@ -103,7 +106,18 @@ class AmplifierSettings(SupplySettings, TcpSettings):
         )
 
 
-class AnalogForceSettings(ForceSettings, TcpSettings):
+class InputSettings(TcpSettings):
+    """A sensor on a LabJack's input. It takes two connections: its sensors share one, the guard has the other."""
+
+    @property
+    def shared_place(self) -> tuple[object, ...] | None:
+        return (self.host, self.tcp_port)
+
+    def open_shared(self, names: Sequence[str]) -> Sequence[ByteLink]:
+        return shared(self.open(" and ".join(names)), len(names))
+
+
+class AnalogForceSettings(ForceSettings, InputSettings):
     """A force sensor with a voltage output on a LabJack; its certificate corrects the newtons of ``newtons_per_V``."""
 
     driver: Literal["labjack-force"] = Field(description="Load cell with a voltage output on a LabJack's input.")
@@ -114,7 +128,7 @@ class AnalogForceSettings(ForceSettings, TcpSettings):
     rate_Hz: float = Field(default=50.0, gt=0, le=200, description="How often it is read (Hz). Typical: 50.")
 
 
-class AnalogDisplacementSettings(TcpSettings):
+class AnalogDisplacementSettings(InputSettings):
     """A displacement sensor with a voltage output on a LabJack."""
 
     rate_key: ClassVar[str] = "rate_Hz"

@@ -5,6 +5,8 @@ Everything is a register: inputs, outputs, digital lines, the watchdog, whose se
 is clamped and quantised; what is read back is what it puts out. In strict mode only its key clears the watchdog; when
 its time is over it acts, again each time.
 
+Instruments of one bench with the same product and serial number are on one device, which takes two connections.
+
 Sources: the maker's register map (ljm_constants.json) and T-series datasheet. Assumed, for no source says it: a
 watchdog of n seconds acts after exactly n; a read-only or unknown register is refused with reason 2.
 """
@@ -43,25 +45,30 @@ class _Refused(Exception):
 
 
 class Box:
-    """The registers of one LabJack, without what is connected to it.
+    """The registers of one LabJack, and what is connected to it.
 
     Parameters
     ----------
     product, serial : int
         4, 7 or 8; serial number.
-    inputs : callable
-        ``inputs(channel, t)`` gives the volts at an analogue input.
+
+    Attributes
+    ----------
+    inputs : dict
+        By analogue input, ``volts(channel, t)`` at it.
     changed : callable
         ``changed(t)`` is called after an output has changed.
+    connections : int
+        How many hosts it serves at once.
     """
 
-    def __init__(
-        self, product: int, serial: int, inputs: Callable[[int, float], float], changed: Callable[[float], None]
-    ) -> None:
+    connections = 2
+
+    def __init__(self, product: int, serial: int) -> None:
         self.dac_top, self._steps, self._ain_top = PRODUCTS[product]
         self._product, self._serial = product, serial
-        self._inputs = inputs
-        self._changed = changed
+        self.inputs: dict[int, Callable[[int, float], float]] = {}
+        self.changed: Callable[[float], None] = lambda t: None
         self._kept: dict[int, bytes] = {}  # watchdog settings, in flash
         self.flash_writes = 0
         self.watchdog_acted = 0
@@ -80,7 +87,7 @@ class Box:
         """Lose power and come back: outputs at their defaults, lines floating high; the watchdog keeps its settings."""
         self._power_up(t + BOOT_S)
         self.asleep_until = t + BOOT_S
-        self._changed(t)
+        self.changed(t)
 
     def level(self, line: int) -> bool:
         """Level of a digital line, high while it is an input with nothing on it."""
@@ -107,7 +114,7 @@ class Box:
             mask = ~self._setting(61_636) & ((1 << LINES) - 1)
             self.state = self.state & ~mask | self._setting(61_632) & mask
             self.direction = self.direction & ~mask | self._setting(61_634) & mask
-        self._changed(t)
+        self.changed(t)
 
     def _write_watchdog(self, address: int, data: bytes, t: float) -> None:
         if address == 61_614:
@@ -158,12 +165,13 @@ class Box:
         if 0 <= address < 28 and address % 2 == 0:
             channel = address // 2
             end = 1.06 * self._ranges[channel]
-            return struct.pack(">f", min(max(self._inputs(channel, t), -end), end))
+            volts = self.inputs[channel](channel, t) if channel in self.inputs else 0.0
+            return struct.pack(">f", min(max(volts, -end), end))
         if 40_000 <= address < 40_028 and address % 2 == 0:
             return struct.pack(">f", self._ranges[(address - 40_000) // 2])
         if 2000 <= address < 2000 + LINES:
             self.direction &= ~(1 << (address - 2000))  # reading a line makes it an input
-            self._changed(t)
+            self.changed(t)
             return struct.pack(">H", self.level(address - 2000))
         if address in WATCHDOG and address % 2 == 0 and address != 61_614:
             return self._kept.get(address, b"\0\0\0\0")
@@ -191,7 +199,7 @@ class Box:
             self._write_watchdog(address, data, t)
         else:
             raise _Refused(ADDRESS)
-        self._changed(t)
+        self.changed(t)
 
 
 class Server:
@@ -289,6 +297,15 @@ class BoxTruth(NetworkTruth):
     input_offset_mV: float = Field(default=0.3, description="Offset of its inputs (mV).")
 
 
+def box_of(truth: BoxTruth, world: World) -> Box:
+    """The device that an instrument is on: one for all with this product and serial number."""
+    key = ("LabJack", truth.product, truth.serial_number)
+    box = world.devices.get(key) or Box(truth.product, truth.serial_number)
+    assert isinstance(box, Box)
+    world.devices[key] = box
+    return box
+
+
 class AmplifierTruth(OutputTruth, BoxTruth):
     """An HV amplifier on a LabJack: input on DAC0, monitors of voltage and current on AIN0 and AIN1, enable on FIO0."""
 
@@ -315,7 +332,9 @@ class Amplifier:
         self._frozen: tuple[float, float] | None = None
         self._rail = 0
         self._tick = 0
-        self.box = Box(truth.product, truth.serial_number, self._input, self._drive)
+        self.box = box_of(truth, world)
+        self.box.inputs |= dict.fromkeys((0, 1), self._input)
+        self.box.changed = self._drive
         self._server = Server(self.box, wire)
         if truth.start_live_V:
             self.box.write(2000, b"\0\0", 0.0)
@@ -399,8 +418,6 @@ class Amplifier:
         return math.copysign(1.0, s.gain_V_per_V) * self._world.current(t) * 1e6 / s.monitor_uA_per_V
 
     def _input(self, channel: int, t: float) -> float:
-        if channel > 1:
-            return 0.0
         if self._rail:
             return self._rail * 20.0
         s = self._truth
@@ -467,7 +484,8 @@ class AnalogSensor:
         self._rng = rng
         self._frozen: float | None = None
         self._rail = 0
-        self.box = Box(truth.product, truth.serial_number, self._input, lambda t: None)
+        self.box = box_of(truth, world)
+        self.box.inputs[2 if isinstance(truth, AnalogForceTruth) else 3] = self._input
         self._server = Server(self.box, wire)
 
     @property
@@ -515,8 +533,6 @@ class AnalogSensor:
         return s.volts_at_full_scale * (true + noise * float(self._rng.standard_normal())) + offset
 
     def _input(self, channel: int, t: float) -> float:
-        if channel != (2 if isinstance(self._truth, AnalogForceTruth) else 3):
-            return 0.0
         if self._rail:
             return self._rail * 20.0
         s = self._truth
