@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -48,7 +49,7 @@ pytestmark = [
 class Running:
     """A run under way on a served bench."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, voltages: str = "[800]") -> None:
         self.folder = folder
         text = (FIXTURES / "scenes" / "analogue-amplifier.toml").read_text()
         for old, new in CHANGES.items():
@@ -58,7 +59,7 @@ class Running:
         scene.write_text(text)
         short = (FIXTURES / "protocols" / "short.toml").read_text()
         short = short.replace("duration_s = 0.5", "duration_s = 3.0")  # enough samples on a busy machine, too
-        (folder / "protocol.toml").write_text(short.replace("[0, 800]", "[800]"))
+        (folder / "protocol.toml").write_text(short.replace("[0, 800]", voltages))
         self.bench = ServedBench(simulated_bench(load_scene(scene)[0]))
         self.bench.__enter__()
         (folder / "ports.json").write_text(json.dumps(dict(self.bench.ports)))
@@ -126,6 +127,40 @@ def running(tmp_path: Path) -> Iterator[Running]:
     run = Running(tmp_path)
     yield run
     run.close()
+
+
+def dea_rig(folder: Path, *arguments: str) -> str:
+    command = [sys.executable, "-m", "rig", *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_whole_job_with_amplifier_force_and_monitor_on_one_device(tmp_path: Path) -> None:
+    """Two connections: one of the sensors, one of the guard. Whoever comes third is turned away."""
+    run = Running(tmp_path, "[0, 800]")
+    try:
+        places = {role: run.bench.ports[role] for role in ("force", "displacement", "hv")}
+        assert len({tuple(place.items()) for place in places.values()}) == 1
+        run.until_live()
+        third = (str(places["hv"]["host"]), int(places["hv"]["tcp_port"]))
+        with socket.create_connection(third, timeout=5) as viewer:
+            assert viewer.recv(10) == b""
+        end = time.monotonic() + 80
+        while run.process.poll() is None:
+            run.confirm()
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        run.out.seek(0)
+        told = run.out.read()
+        assert run.process.returncode == 0 and "high voltage off" in told, told
+        assert run.dac() == 0.0
+    finally:
+        run.close()
+    assert "every sample comes out as recorded, bit for bit" in dea_rig(tmp_path, "replay", "--verify", "a.mcap")
+    dea_rig(tmp_path, "fit", "a.mcap", "-o", "fit.json")
+    found = json.loads((tmp_path / "fit.json").read_text())["quantities"]["eps_r"]
+    assert abs(found["value"] - 1.7) < 4 * found["standard_uncertainty"] < 2 * 1.7
 
 
 def off_within(running: Running, sent: int) -> float:
