@@ -101,6 +101,7 @@ class _TcpPort:
         self.refuses = refuses
         self.lost_bytes = 0
         self.stalled = False  # as `_Port` has it
+        self._listening: socket.socket
         self._listening = socket.create_server(("127.0.0.1", 0), backlog=2) if beside is None else beside._listening
         self._listening.setblocking(False)
         self.number = int(self._listening.getsockname()[1])
