@@ -50,6 +50,8 @@ class SpecimenTable(Table):
     def _named(self) -> Self:
         if PLAIN_NAME.fullmatch(self.name) is None:
             raise ValueError(f"name = {self.name!r}: letters, digits, dot, dash and underscore only, 60 at most")
+        if re.search(r"\.\d+$", self.name):
+            raise ValueError(f"name = {self.name!r}: a dot and a number at its end mean a second run of a specimen")
         return self
 
 

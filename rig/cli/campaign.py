@@ -149,7 +149,10 @@ def _go(
             run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down)
         except NotSafe:
             raise
-        except (FaultError, LimitError, DeviceError) as error:  # this specimen has failed; the next one may not
+        except (FaultError, LimitError, DeviceError) as error:
+            if not out.exists():  # nothing was done with it: a port that is not there will not be there for the next
+                raise
+            # This specimen has failed; the next one may not.
             click.echo(f"{one.specimen.name}: {error}", err=True)
             for text in getattr(error, "__notes__", ()):
                 click.echo(text, err=True)

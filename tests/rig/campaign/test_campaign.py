@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import json
 import os
 import random
 import shutil
@@ -159,6 +160,7 @@ def test_by_chance_in_blocks_of_one_of_each_batch_and_the_same_again(place: Path
     [
         ('name = "film-2"', 'name = "FILM-1"', "stands twice"),
         ('name = "film-2"', 'name = "../film"', "letters, digits"),
+        ('name = "film-2"', 'name = "film-1.2"', "a second run"),
         ('protocol = "breakdown.toml"\n', "", "has no protocol"),
         ("thickness_um = 40.5", "thicknes_um = 40.5", "thickness_um"),
         ('scene = "../bench/scene.toml"', 'scene = "none.toml"', "none.toml"),
@@ -171,6 +173,16 @@ def test_what_cannot_be_used_is_said_before_anything_is_mounted(place: Path, old
     done = say("run", file, "--arm", "--yes")
     assert done.exit_code == 2 and said in done.output, done.output
     assert not list(place.glob("logs/*"))
+
+
+def test_a_bench_that_is_not_there_ends_the_campaign_at_once(place: Path) -> None:
+    ports = {role: {"port": "/dev/no-such-port"} for role in ("stage", "force", "displacement")}
+    ports["hv"] = {"interface": "slcan", "can_channel": "/dev/no-such-port"}
+    (place / "ports.json").write_text(json.dumps(ports))
+    words = ["campaign", "run", str(place / "campaign.toml"), "--ports", str(place / "ports.json"), "--arm"]
+    done = CliRunner().invoke(main, words, input="y\n" * 5)
+    assert done.exit_code == 4 and "no-such-port" in done.output, done.output
+    assert done.output.count("is mounted") == 1 and not list(place.glob("logs/*.mcap*"))
 
 
 def test_a_name_that_is_none_is_refused_with_those_there_are(place: Path) -> None:
