@@ -14,10 +14,11 @@ from calibration.film import search
 from calibration.film.curve import Curve
 from calibration.film.identify import compare, identify, secant_modulus
 from calibration.film.problem import NODES, Problem
-from calibration.film.propagation import least_tangent, stiffening
+from calibration.film.propagation import least_tangent
 from calibration.film.reduction import select
 from calibration.film.result import Identification
 from calibration.film.search import minimise_many
+from calibration.film.systematic import stiffening
 from model.material.materials import NAMED, Material
 from model.membrane.solve import Status, solve_many
 
