@@ -45,7 +45,8 @@ from rig.safety.limits import FilmLimits, Limits
 from rig.scene.scene import Scene
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005
-STATE_S = 0.05  # how often the engine hears from us at least
+STATE_S = 0.05  # how often the engine hears how it stands at least
+ALIVE_S = 0.02  # ... and that this loop turns
 AGAIN_S = 0.1  # a command that failed is given again at this interval
 INSIST_S = 1.0  # an off that was sent but is not measured is sent again at this interval
 BEGIN_S = 30.0  # how long the engine may take to say what is to be guarded
@@ -143,7 +144,7 @@ class Server:
         self._gain = 1.0
         self._polled_at = 0.0
         self._log: RemoteLog | None = None
-        self._next_state = 0.0
+        self._next_state = self._next_alive = 0.0
         self._again = 0.0
         self._off_at: float | None = None  # when the output was taken off that is not measured off yet
         self._off_limit = 0.0  # ... after which time it must be measured off
@@ -188,6 +189,9 @@ class Server:
         self._insist(guard, now)
         if now >= self._next_state:
             self._tell_state(guard, supply, now)
+        elif now >= self._next_alive:
+            self._channel.send({"is": "alive"})
+            self._next_alive = now + ALIVE_S
 
     def _receive(self) -> list[Message]:
         try:
@@ -326,7 +330,7 @@ class Server:
     # What the engine is told -----------------------------------------------------------------------------------
 
     def _tell_state(self, guard: Guard, supply: HVSupply, now: float) -> None:
-        self._next_state = now + STATE_S
+        self._next_state, self._next_alive = now + STATE_S, now + ALIVE_S
         self._channel.send(
             {
                 "is": "state",

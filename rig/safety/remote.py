@@ -32,9 +32,10 @@ from rig.safety.limits import FilmLimits, Limits
 from rig.scene.scene import Scene
 
 START_S = 30.0  # until the process must have the link; a slow disk has many modules to read
-# A guard that says nothing for SILENCE_S is lost: it sends its state twenty times a second. One that was asked, and
-# works out what the film bears, gets ANSWER_S. Before any voltage a loaded computer may take longer.
-SILENCE_S, ANSWER_S = 0.2, 0.25
+# A guard that says nothing for SILENCE_S is lost: it says fifty times a second that it turns, so that a loaded computer
+# may hold it up for 0.14 s. One that was asked, and works out what the film bears, gets ANSWER_S. Before any voltage a
+# loaded computer may take longer.
+SILENCE_S, ANSWER_S = 0.16, 0.25
 UNARMED_S = 2.0
 LATE_S = 0.02  # a turn that took longer than this is the host's fault: nobody listened
 OPEN_AGAIN_S = 0.1
