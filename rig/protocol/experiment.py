@@ -9,6 +9,7 @@ from pathlib import Path
 
 from calibration.sensors.certificate import Certificate
 from drivers.settings import CanSettings
+from rig.base import served
 from rig.base.certificates import load_certificate
 from rig.base.errors import ConfigError, LimitError
 from rig.log.contents import IN_MEMORY, ON_PORTS, ON_SERVED_PORTS, REPLAY_OF
@@ -47,14 +48,15 @@ class Experiment:
     def bench(self) -> str:
         """On what bench it runs, in the words of `rig.log.contents`.
 
-        Ports are simulated only when ``dea-rig sim`` printed them and they are the pseudo-terminals that it makes;
-        ports that somebody typed, into a scene or into a file, are real.
+        Ports are simulated only when ``dea-rig sim`` printed them and a simulated bench serves these very
+        pseudo-terminals at this moment; ports that somebody typed, into a scene or into a file, are real, and so are
+        those of a list whose server has ended.
         """
         if self.scene.bench is not None:
             return f"{REPLAY_OF}{Path(self.scene.bench.log).name}"
         if not self.scene.on_real_ports:
             return IN_MEMORY
-        return ON_SERVED_PORTS if self.served and _all_pseudo_terminals(self.scene) else ON_PORTS
+        return ON_SERVED_PORTS if self.served and _all_served(self.scene) else ON_PORTS
 
     @property
     def highest_voltage(self) -> float:
@@ -93,8 +95,8 @@ def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, ob
     except (ConfigError, LimitError) as error:
         raise type(error)(f"{protocol_path} on {scene_path}: {error}", device=error.device, cause=error.cause) from None
     _check_limits(scene, scene_path, certificates, actions)
-    served = ports is not None and are_served(ports)
-    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions, served=served)
+    printed = ports is not None and are_served(ports)
+    return Experiment(scene, scene_text, protocol, protocol_text, certificates, actions, predictions, served=printed)
 
 
 def are_served(ports: Mapping[str, object]) -> bool:
@@ -102,15 +104,17 @@ def are_served(ports: Mapping[str, object]) -> bool:
     return ports.get(SERVED_BY) == SERVER
 
 
-def _all_pseudo_terminals(scene: Scene) -> bool:
-    """Whether every port is a pseudo-terminal, behind whatever name."""
+def _all_served(scene: Scene) -> bool:
+    """Whether every port is a pseudo-terminal, behind whatever name, that one simulated bench serves."""
+    names = []
     for table in scene.instruments.values():
         name = getattr(table, "port", None)
         if isinstance(table, CanSettings) and table.interface == "slcan":
             name = table.can_channel
         if name is None or not os.path.realpath(name).startswith(PSEUDO_TERMINALS):
             return False
-    return True
+        names.append(name)
+    return bool(names) and served.are_served(names)
 
 
 def certificates_of(scene: Scene, path: Path) -> dict[str, Certificate]:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from rig.base.clock import Clock
+from rig.base.served import Announcement
 from rig.sim.slcan import SlcanAdapter
 from rig.sim.wire import ByteWire, FrameWire, TcpWire, WireGone
 
@@ -191,6 +192,7 @@ class Server:
         self._bench = bench
         self._clock = clock
         self._ports: dict[str, _Port | _TcpPort] = {}
+        self._announcement = Announcement()
         bench.prepare()
         try:
             for role in bench.instruments:
@@ -200,6 +202,7 @@ class Server:
         except BaseException:
             self.close()
             raise
+        self._announce()
 
     def _tcp_port(self, role: str, line: _Line, wire: TcpWire) -> _TcpPort:
         box = getattr(self._bench.instruments[role], "box", None)
@@ -257,6 +260,7 @@ class Server:
             return
         if not port.is_open:
             port.open()
+            self._announce()
         data = port.line.host_read(now)
         if data and not port.stalled:
             port.write(data)
@@ -272,8 +276,12 @@ class Server:
 
     def close(self) -> None:
         """Close all ports; hosts see them vanish."""
+        self._announcement.withdraw()
         for port in self._ports.values():
             port.close()
+
+    def _announce(self) -> None:
+        self._announcement.say(port.name for port in self._ports.values() if isinstance(port, _Port))
 
 
 def _comes_last(port: _Port | _TcpPort) -> bool:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
+from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 
@@ -11,12 +14,18 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rig.analysis.film import _check_one_kind
+from rig.base.clock import RealClock
 from rig.base.errors import ConfigError, DataError
+from rig.base.served import Announcement, _began, are_served
 from rig.cli.app import main
 from rig.log.contents import IN_MEMORY, ON_PORTS, ON_SERVED_PORTS
 from rig.protocol.experiment import SERVED_BY, SERVER, Experiment, prepare
 from rig.run.resume import _check_bench
 from rig.run.run import Consent, run
+from rig.scene.scene import load_scene
+from rig.sim.bench import SimulatedBench
+from rig.sim.server import Server
+from rig.sim.settings import SimulationSettings
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
 
@@ -26,13 +35,28 @@ REAL = "/dev/ttyUSB77"
 
 
 @pytest.fixture
-def terminal() -> str:
+def own_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / "dea-rig"
+
+
+@pytest.fixture
+def unserved() -> Iterator[str]:
     master, slave = os.openpty()
     try:
-        yield os.ttyname(slave)  # type: ignore[misc]
+        yield os.ttyname(slave)
     finally:
         os.close(master)
         os.close(slave)
+
+
+@pytest.fixture
+def terminal(own_directory: Path, unserved: str) -> Iterator[str]:
+    """One that this process says it serves."""
+    announcement = Announcement()
+    announcement.say([unserved])
+    yield unserved
+    announcement.withdraw()
 
 
 def ports(port: str, hv: str) -> dict[str, dict[str, str]]:
@@ -56,6 +80,39 @@ def test_only_pseudo_terminals_that_the_simulation_printed_are_simulated(termina
     named.unlink()
     named.symlink_to(REAL)
     assert experiment(ports(str(named), terminal), marked=True).bench == ON_PORTS
+
+
+def test_a_list_of_ports_whose_server_has_ended_is_of_real_ports(own_directory: Path, unserved: str) -> None:
+    """The system has given the names to somebody else since."""
+    assert experiment(ports(unserved, unserved), marked=True).bench == ON_PORTS
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    own = {"pid": os.getpid(), "began": _began(os.getpid()), "ports": [unserved]}
+    file = own_directory / "served-1-0.json"
+    for said, bench in (
+        (own, ON_SERVED_PORTS),
+        (own | {"pid": ended.pid}, ON_PORTS),  # killed: nobody withdrew it
+        (own | {"began": "1"}, ON_PORTS),  # another process has its number
+        (own | {"ports": ["/dev/pts/99999"]}, ON_PORTS),
+        ([], ON_PORTS),
+    ):
+        file.write_text(json.dumps(said))
+        assert experiment(ports(unserved, unserved), marked=True).bench == bench
+    if Path("/proc/self/fdinfo").is_dir():
+        other = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+        file.write_text(json.dumps(own | {"pid": other.pid, "began": _began(other.pid)}))
+        bench = experiment(ports(unserved, unserved), marked=True).bench  # it lives, and has no such terminal
+        other.communicate(b"\n")
+        assert bench == ON_PORTS
+
+
+def test_a_served_bench_says_which_terminals_are_its_own(own_directory: Path) -> None:
+    bench = SimulatedBench(SimulationSettings(seed=1), load_scene(SCENE)[0].specimen.specimen(), {"stage", "hv"})
+    server = Server(bench, RealClock())
+    names = [keys.get("port", keys.get("can_channel")) for keys in server.ports.values()]
+    assert are_served(map(str, names)) and not are_served(["/dev/null"])
+    server.close()
+    assert not are_served(map(str, names)) and not list(own_directory.glob("served-*"))
 
 
 def invoke(tmp_path: Path, scene: Path, *options: str) -> Result:

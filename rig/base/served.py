@@ -1,0 +1,117 @@
+"""Which pseudo-terminals lead to a simulated bench, provably: said by the process that serves it, while it does.
+
+The server keeps a file in this user's own directory, which nobody else can write: its process number, when that process
+began, and the terminals that it serves. It counts only while that very process lives and, where the system tells
+(Linux), has the other ends of these terminals open. A list of ports that was printed once proves nothing later: the
+system gives the same names to others.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from drivers.links.port_lock import remove_if_empty, user_directory
+
+LARGEST = 4096  # bytes of such a file
+_numbers = itertools.count()
+
+
+class Announcement:
+    """What one server says of itself. Where no file can be kept its ports count as real."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+
+    def say(self, ports: Iterable[str]) -> None:
+        """These are its terminals from now on."""
+        content = {
+            "pid": os.getpid(),
+            "began": _began(os.getpid()),
+            "ports": [os.path.realpath(port) for port in ports],
+        }
+        with suppress(OSError):
+            path = self._path or user_directory() / f"served-{os.getpid()}-{next(_numbers)}.json"
+            part = path.with_suffix(".part")
+            part.write_text(json.dumps(content), encoding="utf-8")
+            part.replace(path)
+            self._path = path
+
+    def withdraw(self) -> None:
+        """It serves no more."""
+        path, self._path = self._path, None
+        if path is not None:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+                remove_if_empty(path.parent)
+
+
+def are_served(ports: Iterable[str]) -> bool:
+    """Whether each of these ports, behind whatever name, is served by a simulated bench at this moment."""
+    wanted = {os.path.realpath(port) for port in ports}
+    try:
+        files = sorted(user_directory().glob("served-*.json"))
+    except OSError:
+        return False
+    for file in files:
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            said = json.loads(file.read_bytes()[:LARGEST])
+            if wanted <= set(said["ports"]) and _is_true(int(said["pid"]), str(said["began"]), wanted):
+                return True
+    return False
+
+
+def _is_true(pid: int, began: str, ports: set[str]) -> bool:
+    try:
+        os.kill(pid, 0)
+    except OSError:
+        return False
+    if _began(pid) != began:
+        return False
+    held = _terminals_of(pid)
+    return held is None or ports <= held
+
+
+def _began(pid: int) -> str:
+    """When the process began, in whatever unit the system has; empty where it does not say."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return ""
+
+
+def _terminals_of(pid: int) -> set[str] | None:
+    """The pseudo-terminals whose other ends the process has open; None where the system does not say."""
+    if not _system_tells():
+        return None
+    found = set()
+    for one in Path(f"/proc/{pid}/fdinfo").iterdir():
+        with suppress(OSError, ValueError):
+            found |= {f"/dev/pts/{number}" for number in _terminals_in(one)}
+    return found
+
+
+def _terminals_in(file: Path) -> list[int]:
+    lines = file.read_text().splitlines()
+    return [int(line.split()[1]) for line in lines if line.startswith("tty-index:")]
+
+
+@cache
+def _system_tells() -> bool:
+    """Whether the system says of an open descriptor to which pseudo-terminal it is the other end."""
+    try:
+        master, slave = os.openpty()
+    except (OSError, AttributeError):
+        return False
+    try:
+        return bool(_terminals_in(Path(f"/proc/self/fdinfo/{master}")))
+    except (OSError, ValueError):
+        return False
+    finally:
+        os.close(master)
+        os.close(slave)
