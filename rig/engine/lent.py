@@ -19,7 +19,6 @@ from rig.base.errors import ConfigError
 from rig.base.outputs import write_text
 from rig.bench.bench import Bench
 from rig.log.recorder import Recorder
-from rig.log.schema import SETTINGS
 
 GIVE_BACK_S = 1.0  # how long the stage may take to confirm that it has its settings back
 LARGEST = 4096  # bytes of such a file
@@ -44,7 +43,7 @@ class Lent:
             left = stage.resume_found(_read(self._path))
             if left:
                 now_found = ", ".join(f"{key} {value}" for key, value in stage.found.items())
-                self._recorder.command("stage" + SETTINGS, "resume_found", now_found)
+                self._recorder.command("stage", "resume_found", now_found)
                 what = ", ".join(f"{key} {now}, before {before}" for key, (now, before) in left.items())
                 self._warn(f"an earlier run was killed and left changed: {what}; given back after this one")
             write_text(self._path, json.dumps(dict(stage.found)) + "\n")
@@ -58,7 +57,7 @@ class Lent:
         if not isinstance(stage, GivesBack) or not standing:
             return
         if not stage.given_back:
-            self._recorder.command("stage" + SETTINGS, "give_back", "")
+            self._recorder.command("stage", "give_back", "")
             wait_given_back("stage", stage.give_back, lambda: stage.given_back, self._bench, self._recorder)
         if not stage.given_back:  # the driver's close tries once more, without waiting
             self._warn("it has not confirmed that its settings are as they were found")

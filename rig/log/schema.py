@@ -24,7 +24,7 @@ SCHEMA_VERSION = 2
 PACKAGE = "dearig.v2"
 ROLES = ("stage", "force", "displacement", "hv")
 SETTINGS = ".settings"
-"""Of a command's device: it is about settings that were lent, not about what the device does."""
+"""Of the supply as a command's device: it is about its settings that were lent, not about its output."""
 
 
 class Field(NamedTuple):

@@ -187,7 +187,7 @@ def _seconds(ns: int) -> float:
 def _is_decision(topic: str, fields: Mapping[str, Any]) -> bool:
     if counted_device(topic, fields):
         return True
-    return topic in DECISIONS and fields.get("device", "stage") in ("stage", "stage.settings")
+    return topic in DECISIONS and fields.get("device", "stage") == "stage"
 
 
 def _entries(recording: Recording) -> list[_Turn | _Decision]:
