@@ -137,7 +137,7 @@ def _add_line(recording: rr.RecordingStream, path: str, t: NDArray[np.float64], 
     thin = path.endswith("asked")
     colour = INK if thin else SERIES[path.split("/")[0]]
     recording.log(path, rr.SeriesLines(colors=colour, names=path, widths=1.0 if thin else 2.0), static=True)
-    recording.send_columns(path, indexes=[_times(t)], columns=rr.Scalars.columns(scalars=values))
+    recording.send_columns(path, indexes=[time_column(t)], columns=rr.Scalars.columns(scalars=values))
 
 
 def _add_phases(recording: rr.RecordingStream, run: Run) -> None:
@@ -158,7 +158,7 @@ def _add_phases(recording: rr.RecordingStream, run: Run) -> None:
         changed = [k for k in range(len(states)) if k == 0 or states[k] != states[k - 1]]
         recording.send_columns(
             f"{PHASES}/{name}",
-            indexes=[_times(t[changed])],
+            indexes=[time_column(t[changed])],
             columns=rr.StateChange.columns(state=[states[k] for k in changed]),
         )
 
@@ -224,7 +224,7 @@ def _add_loop(recording: rr.RecordingStream, run: Run) -> None:
     recording.log(f"{LOOP}/now", rr.Points2D.from_fields(colors=[ACCENT], radii=rr.Radius.ui_points(5.0)), static=True)
     recording.send_columns(
         f"{LOOP}/now",
-        indexes=[_times(run.t[rows])],
+        indexes=[time_column(run.t[rows])],
         columns=rr.Points2D.columns(positions=place(run.h[rows] * 1e3, run.force[rows])),
     )
 
@@ -277,7 +277,7 @@ def _add_film(recording: rr.RecordingStream, film: _Film) -> None:
     recording.log(f"{FILM}/surface", rr.Mesh3D.from_fields(triangle_indices=_triangles()), static=True)
     recording.send_columns(
         f"{FILM}/surface",
-        indexes=[_times(film.t)],
+        indexes=[time_column(film.t)],
         columns=rr.Mesh3D.columns(
             vertex_positions=positions.reshape(-1, 3).astype(np.float32),
             vertex_normals=normals.reshape(-1, 3).astype(np.float32),
@@ -293,7 +293,7 @@ def _add_film(recording: rr.RecordingStream, film: _Film) -> None:
         recording.log(f"{FILM}/circle_{k}", style, static=True)
         recording.send_columns(
             f"{FILM}/circle_{k}",
-            indexes=[_times(film.t)],
+            indexes=[time_column(film.t)],
             columns=rr.LineStrips3D.columns(strips=list(closed[:, k].astype(np.float32))),
         )
 
@@ -349,7 +349,7 @@ def _add_events(recording: rr.RecordingStream, run: Run) -> None:
         times, names, texts = zip(*rows, strict=True)
         recording.send_columns(
             EVENTS,
-            indexes=[_times(np.array(times))],
+            indexes=[time_column(np.array(times))],
             columns=rr.TextLog.columns(
                 text=[f"{t:8.2f} s   {printable(text)}" for t, text in zip(times, texts, strict=True)],
                 level=list(names),
@@ -371,7 +371,7 @@ def _about(run: Run) -> str:
     return "\n".join(lines)
 
 
-def _times(t: NDArray[np.float64]) -> rr.TimeColumn:
+def time_column(t: NDArray[np.float64]) -> rr.TimeColumn:
     import rerun as rr
 
     return rr.TimeColumn(TIMELINE, duration=t)

@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -23,12 +24,16 @@ from rig.base.clock import RealClock
 from rig.base.errors import ConfigError, RigError
 from rig.base.text import printable
 from rig.log.dataset import Run, load_run
+from rig.log.errors import LogError
+from rig.log.follow import growing
+from rig.view.live import stream
 from rig.view.recording import TIMELINE, best_instant, write_recording
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
 
 WINDOW = "1600x1000"
+MEMORY = "1GB"  # of a viewer that follows: what is older goes
 PICTURE_S = 120.0  # on a machine without a graphics card
 
 
@@ -64,9 +69,61 @@ def view(log_path: Path, *, save: Path | None = None, screenshot: Path | None = 
             _open_viewer(recording, folder)
 
 
-def _open_viewer(recording: Path, folder: Path) -> None:
+def follow(log_path: Path) -> None:
+    """Open a viewer that shows a log as it grows; ends with the viewer. The run does not wait for it.
+
+    Raises
+    ------
+    rig.log.errors.LogError
+        The log cannot be read.
+    RigError
+        There is no display, or the viewer failed.
+    """
+    _need_display()
+    growing(log_path)
+    with tempfile.TemporaryDirectory(prefix="dea-rig-view-") as name:
+        with following(log_path, Path(name)) as (viewer, _):
+            code = viewer.wait()
+        if code != 0:
+            raise RigError(f"The viewer ended with code {code}. Its last words: {_last_words(Path(name))}")
+
+
+@contextmanager
+def following(log_path: Path, folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """A viewer, its port, and a thread that sends it what is added to the log."""
+    os.environ.setdefault("RUST_LOG", "off")  # a window that is closed is no error
+    import rerun as rr
+
+    port = _free_port()
+    with _viewer(folder, "--hide-welcome-screen", "--memory-limit", MEMORY, "--port", str(port), *options) as viewer:
+        recording = rr.RecordingStream("dea_rig", recording_id=log_path.name)
+        closing = threading.Event()
+
+        def send() -> None:
+            while not _listens(port):
+                if closing.wait(0.1) or viewer.poll() is not None:
+                    return
+            recording.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
+            with suppress(LogError):
+                stream(log_path, recording, lambda: not closing.is_set() and viewer.poll() is None)
+
+        sender = threading.Thread(target=send, name="view: log", daemon=True)
+        sender.start()
+        try:
+            yield viewer, port
+        finally:
+            closing.set()
+            sender.join(5.0)
+            recording.disconnect()
+
+
+def _need_display() -> None:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RigError("There is no display here. Use --screenshot FILE.png or --save FILE.rrd.")
+
+
+def _open_viewer(recording: Path, folder: Path) -> None:
+    _need_display()
     with _viewer(folder, "--port", "auto", str(recording)) as viewer:
         code = viewer.wait()
     if code != 0:
@@ -156,6 +213,12 @@ def _why_no_picture(messages: str) -> str:
             f"no graphics card is installed by: sudo apt install mesa-vulkan-drivers (the viewer said: {messages})"
         )
     return f"The viewer ended before the picture was made. Its last words: {messages}"
+
+
+def _listens(port: int) -> bool:
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
+        return True
+    return False
 
 
 def _free_port() -> int:

@@ -2,18 +2,22 @@ import json
 import math
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from rig.base.errors import ConfigError, RigError
+from rig.cli.app import main
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
 from rig.view import recording as view_module
 from rig.view import viewer as viewer_module
+from rig.view.live import stream
 from rig.view.viewer import view
 
 HAS_DRIVER = any(
@@ -108,6 +112,58 @@ def test_without_hv_there_is_no_voltage(tmp_path):
     entities = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "run.rrd")).stream()}
     assert {"/film/surface", "/force", "/displacement"} <= entities
     assert not any("voltage" in entity for entity in entities)
+
+
+def test_a_log_that_grows_is_streamed_as_it_comes(tmp_path):
+    """Judged by Rerun's own reader, after the stream has been closed in the midst of the run."""
+    import rerun as rr
+    from rerun.chunk import RrdReader
+
+    path, kept = tmp_path / "run.mcap", tmp_path / "kept.rrd"
+
+    def write(writer, first, last):
+        for k in range(first, last):
+            fields = {"t_s": k / 10, "reading": 0.0, "force_N": 0.1 * k, "flags": 0}
+            writer.write("/force/sample", fields, round(k * 1e8), round(k * 1e8))
+        writer.tick(last / 10 + 1.0)  # what is older than a moment goes into the file
+        writer.tick(last / 10 + 2.0)
+
+    with LogWriter(path) as writer:
+        write(writer, 0, 20)
+        looks = iter(range(4))
+
+        def goes_on():
+            look = next(looks, None)
+            if look == 2:
+                write(writer, 20, 50)
+            return look is not None
+
+        recording = rr.RecordingStream("dea_rig")
+        recording.save(kept)
+        stream(path, recording, goes_on)
+        recording.disconnect()
+        writer.finish({})
+    forces = []
+    for chunk in RrdReader(str(kept)).stream():
+        if chunk.entity_path == "/force" and not chunk.is_static:
+            forces += [value[0] for value in chunk.to_record_batch().column("Scalars:scalars").to_pylist()]
+    np.testing.assert_allclose(forces, 0.1 * np.arange(50))
+
+
+@pytest.mark.slow
+def test_a_viewer_that_follows_is_given_the_log(log, tmp_path):
+    """Through the viewer's own server, which keeps what it was sent; without a window."""
+    kept = tmp_path / "kept.rrd"
+    with viewer_module.following(log, tmp_path, "--save", str(kept)) as (viewer, _):
+        end = time.monotonic() + 60.0
+        while not (kept.exists() and kept.stat().st_size > 10_000):
+            assert viewer.poll() is None and time.monotonic() < end
+            time.sleep(0.1)
+
+
+def test_follow_goes_alone(log, tmp_path):
+    done = CliRunner().invoke(main, ["view", str(log), "--follow", "--save", str(tmp_path / "x.rrd")])
+    assert done.exit_code == 2 and "--follow opens the viewer" in done.output
 
 
 @pytest.mark.slow
