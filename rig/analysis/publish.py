@@ -33,6 +33,7 @@ CONTEXT = ["https://w3id.org/ro/crate/1.1/context", {"sha256": "https://schema.o
 PROFILE = "https://w3id.org/ro/crate/1.1"
 FILM, SHEET = "dea-rig identification 1", "dea-rig homogeneous tests 1"
 MOST_BYTES = 64 * 1024 * 1024
+NO_TERMS = "No terms of use are stated: ask the authors."
 SAME = 1e-6  # relative: digits that another machine may give
 
 

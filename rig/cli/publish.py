@@ -12,9 +12,12 @@ from rig.cli.files import FOLDER, read_json
 
 @click.command("publish")
 @click.argument("result", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=FOLDER, help="Folder to write.")
+@click.option("-o", "--out", type=FOLDER, help="Folder to write; default: RESULT-crate beside RESULT.")
 @click.option(
-    "--license", "terms", help="Terms of use, by address or name: https://creativecommons.org/licenses/by/4.0/"
+    "--license",
+    "terms",
+    default="",
+    help="Terms of use, by address or name, e.g. https://creativecommons.org/licenses/by/4.0/; default: none stated.",
 )
 @click.option("--author", "authors", multiple=True, metavar="NAME", help='Who did it: "Ada L. <0000-0002-1825-0097>".')
 @click.option("--title", default="", help="Title of the data set; default: made from the result.")
@@ -23,7 +26,7 @@ from rig.cli.files import FOLDER, read_json
 def command(
     result: Path,
     out: Path | None,
-    terms: str | None,
+    terms: str,
     authors: tuple[str, ...],
     title: str,
     moved: Path | None,
@@ -37,13 +40,12 @@ def command(
     if check:
         _check(result)
         return
-    if out is None or not terms:
-        raise click.UsageError(
-            "-o FOLDER and --license TERMS are needed: without terms of use nobody may use the data."
-        )
-    from rig.analysis.publish import About, publish
+    from rig.analysis.publish import NO_TERMS, About, publish
 
-    written = publish(result, out, About(terms, title, authors), moved)
+    out = out or result.with_name(f"{result.stem}-crate")
+    written = publish(result, out, About(terms or NO_TERMS, title, authors), moved)
+    if not terms:
+        click.echo("note: no terms of use are stated, so nobody may use the data: --license NAME states them")
     click.echo(f"written: {out} ({len(written)} files); `dea-rig publish --check {out}` fits it again")
 
 

@@ -105,7 +105,15 @@ def test_what_was_changed_or_is_missing_is_refused(published: Path, tmp_path: Pa
     lost = say("publish", str(published / "result.json"), "-o", str(tmp_path / "x"), "--license", TERMS, code=2)
     assert "tensile.csv" in lost and "--data" in lost
     assert not (tmp_path / "x").exists() and not list(tmp_path.glob(".*"))
-    assert "--license" in say("publish", str(published / "result.json"), "-o", str(tmp_path / "x"), code=2)
+
+
+def test_without_terms_of_use_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    table(tmp_path / "tensile.csv")
+    say("fit-tests", "tensile.csv", "--area-mm2", "4", "--terms", "1", "--fix", "alpha1=2", "-o", "fit.json")
+    assert "--license" in say("publish", "fit.json")
+    assert "No terms of use" in entities(tmp_path / "fit-crate")["./"]["license"]
+    assert "exists already" in say("publish", "fit.json", code=2)
 
 
 @pytest.mark.slow
