@@ -85,6 +85,59 @@ def test_it_homes_moves_stops_and_reads_warnings_and_alerts(serve):
     assert stage.bench.world.stage.at(stage.bench.now)[0] == pytest.approx(0.0, abs=1e-9)
 
 
+FURTHER = """
+import json, sys
+from zaber_motion import Units
+from zaber_motion.ascii import Connection
+
+out = {}
+def done(name, call):
+    try:
+        out[name] = call()
+    except Exception as error:
+        out[name] = type(error).__name__
+
+with Connection.open_serial_port(sys.argv[1]) as connection:
+    [device] = connection.detect_devices(identify_devices=False)
+    axis = device.get_axis(1)
+    axis.home()
+    done("renumber", lambda: connection.renumber_devices(1))
+    done("own speed", lambda: axis.generic_command("move abs 20000 30000 500").data)
+    axis.wait_until_idle()
+    out["there"] = axis.get_position()
+    done("too fast", lambda: axis.generic_command("move abs 1 999999999").data)
+    done("park", lambda: axis.park())
+    done("parked", lambda: axis.is_parked())
+    done("move parked", lambda: axis.move_absolute(1000))
+    done("unpark", lambda: axis.unpark())
+    done("disable", lambda: axis.driver_disable())
+    done("flags", lambda: sorted(axis.warnings.get_flags()))
+    done("move disabled", lambda: axis.move_absolute(1000))
+    done("enable", lambda: axis.driver_enable())
+    done("move again", lambda: axis.move_absolute(1000))
+    done("peripheral", lambda: axis.settings.get("peripheral.id"))
+    done("temperature", lambda: device.settings.get("system.temperature"))
+    done("count", lambda: axis.settings.get("encoder.count"))
+    done("store", lambda: device.storage.set_string("rig.note", "mounted"))
+    done("stored", lambda: device.storage.get_string("rig.note"))
+    done("erase", lambda: device.storage.erase_key("rig.note"))
+    done("gone", lambda: device.storage.get_string("rig.note"))
+print(json.dumps(out))
+"""
+
+
+def test_what_else_its_maker_offers(serve):
+    stage = serve("stage")
+    out = stage.client(FURTHER, stage.server.ports["stage"]["port"])
+    assert out["renumber"] == 1, out
+    assert out["own speed"] == "0" and out["there"] == 20000 and out["too fast"] == "BadDataException"
+    assert out["parked"] is True and out["move parked"] == "CommandFailedException"
+    assert "FO" in out["flags"] and out["move disabled"] not in ("none", None)
+    assert out["move again"] is None and out["peripheral"] == 0 and out["temperature"] == 33.4
+    assert abs(out["count"] * 0.5 - 1000 * 0.49609375) < 10.0  # the screw is off by some micrometres
+    assert out["stored"] == "mounted" and out["erase"] is True and out["gone"] == "NoValueForKeyException"
+
+
 def test_it_notices_a_stage_that_lost_its_reference(serve):
     stage = serve("stage", stage={"referenced_at_start": True})
     script = """

@@ -22,6 +22,7 @@ from rig.sim.world import World
 
 DATA_PER_STEP = 1.6384  # speed settings: 1.6384 per microstep/s; acceleration: per 10 000 microsteps/s^2
 FULL_STEP_UM = 6350 / 200  # 6.35 mm screw, 200 steps a turn
+ENCODER_COUNT_M = 0.5e-6  # of its encoder
 PACKET_SIZE = 80  # characters of a reply line, longer ones continue
 ANSWER_S = 0.5e-3
 
@@ -83,6 +84,8 @@ class ZaberStage:
         self._after: Literal["home", "move", "stop"] = "move"
         self._asleep_until = -math.inf
         self._frozen_at: int | None = None
+        self._parked = False  # these two in non-volatile memory
+        self._stored: dict[int, dict[str, str]] = {}
         self.wrong_status: str | None = None
         self.before_reply: Callable[[float], None] | None = None
         s = settings
@@ -118,6 +121,7 @@ class ZaberStage:
             self._flags.clear()
 
     def _power_up(self, t: float) -> None:
+        self._driver_on = True
         self._origin = self._world.stage.at(t)[0]  # what it takes for zero until it is homed
         self._flags = {"WR", "WH"}
         self._line.clear()
@@ -297,6 +301,21 @@ class ZaberStage:
                     return "RJ", "DEVICEONLY"
                 self.reset(t)
                 return "OK", "0"
+            case ["renumber", *first] if len(first) < 2:  # alone on its line it is the first
+                number = int(first[0]) if first and re.fullmatch(r"[0-9]{1,2}", first[0]) else 0 if first else 1
+                if axis or not number:
+                    return "RJ", "DEVICEONLY" if axis else "BADDATA"
+                self._values["comm.address"] = number
+                return "OK", "0"
+            case ["driver", "enable" | "disable" as word]:
+                return self._switch_driver(word == "enable", t)
+            case ["tools", "parking", "park" | "unpark" as word]:
+                if self.busy(t):
+                    return "RJ", "STATUSBUSY"
+                self._parked = word == "park"
+                return "OK", "0"
+            case ["storage", *rest]:
+                return self._storage(rest, axis)
         return "RJ", "BADCOMMAND"
 
     def _execute_elsewhere(self, words: list[str], values: dict[str, int]) -> tuple[str, str]:
@@ -313,7 +332,42 @@ class ZaberStage:
                 return "OK", "00" if words == ["warnings"] else "0"
         return "RJ", "BADDATA" if words[:1] == ["set"] else "BADCOMMAND"
 
+    def _switch_driver(self, on: bool, t: float) -> tuple[str, str]:
+        """Without its driver the carriage stops dead and may be moved by hand."""
+        self._driver_on = on
+        if on:
+            self._flags.discard("FO")
+        else:
+            self._world.stage.rest(t, self._world.stage.at(t)[0])
+            self._settled = t if self.busy(t) else self._settled
+            self._flags.add("FO")
+        return "OK", "0"
+
+    def _storage(self, rest: list[str], axis: int) -> tuple[str, str]:
+        """Words that somebody keeps in the device, by key; those of an axis apart."""
+        kept = self._stored.setdefault(axis, {})
+        match rest:
+            case ["set", key, *words] if words:
+                kept[key] = " ".join(words)
+                return "OK", "0"
+            case ["append", key, *words] if words and key in kept:
+                kept[key] += " ".join(words)
+                return "OK", "0"
+            case ["get", key] if key in kept:
+                return "OK", kept[key]
+            case ["erase", key] if key in kept:
+                del kept[key]
+                return "OK", "0"
+            case ["get" | "erase" | "append", *_]:
+                return "RJ", "BADDATA"
+        return "RJ", "BADCOMMAND"
+
+    def _cannot_move(self) -> str:
+        return "PARKED" if self._parked else "" if self._driver_on else "DRIVERDISABLED"
+
     def _home(self, t: float) -> tuple[str, str]:
+        if why := self._cannot_move():
+            return "RJ", why
         self._start(0.0, self._speed("limit.approach.maxspeed"), t, "home")
         return "OK", "0"
 
@@ -321,6 +375,21 @@ class ZaberStage:
         low, high = self._values["limit.min"], self._values["limit.max"]
         homed = "WR" not in self._flags
         speed = self._speed("maxspeed")
+        if why := self._cannot_move():
+            return "RJ", why
+        acceleration = self._acceleration
+        fixed = 1 if rest[:1] in (["min"], ["max"]) else 2
+        rest, own = rest[:fixed], rest[fixed:]
+        if len(own) > 2 or not all(re.fullmatch(r"[0-9]+", word) for word in own):
+            return "RJ", "BADCOMMAND" if len(own) > 2 else "BADDATA"
+        if own and rest[:1] != ["vel"]:
+            if not 1 <= int(own[0]) <= self._limits["maxspeed"][1]:
+                return "RJ", "BADDATA"
+            speed = int(own[0]) / DATA_PER_STEP * self._step
+        if own and (given := own[-1:] if rest[:1] == ["vel"] else own[1:]):
+            if not 1 <= int(given[0]) <= self._limits["accel"][1]:
+                return "RJ", "BADDATA"
+            acceleration = int(given[0]) * 1e4 / DATA_PER_STEP * self._step
         match rest:
             case ["min"]:
                 target = low
@@ -350,7 +419,7 @@ class ZaberStage:
         goal = self._origin + target * self._step
         if not homed:  # its limits mean nothing; the ends of the screw do
             goal = self._settings.travel_mm * 1e-3 if target == high else 0.0
-        self._start(goal, speed, t, "move")
+        self._start(goal, speed, t, "move", acceleration)
         return "OK", "0"
 
     def _speed(self, name: str) -> float:
@@ -361,11 +430,13 @@ class ZaberStage:
     def _acceleration(self) -> float:
         return self._values["accel"] * 1e4 / DATA_PER_STEP * self._step
 
-    def _start(self, goal: float, speed: float, t: float, after: Literal["home", "move"]) -> None:
+    def _start(
+        self, goal: float, speed: float, t: float, after: Literal["home", "move"], acceleration: float = 0.0
+    ) -> None:
         if self.busy(t):
             self._flags.add("NI")
         x, v = self._world.stage.at(t)
-        self._world.stage.follow(t, trapezoid(x, v, goal, speed, self._acceleration))
+        self._world.stage.follow(t, trapezoid(x, v, goal, speed, acceleration or self._acceleration))
         self._settled, self._after = self._world.stage.end, after
 
     def _brake(self, t: float) -> None:
@@ -383,6 +454,7 @@ class ZaberStage:
             "version.build": "9999",
             "system.axiscount": "1",
             "system.voltage": "48.0",
+            "system.temperature": "33.4",
             "device.hw.modified": "0",
             "comm.packet.size.max": str(PACKET_SIZE),
             "comm.command.packets.max": "1",
@@ -400,8 +472,14 @@ class ZaberStage:
             return "OK", str(round((self._world.carriage_at(t) - self._origin) / self._step))
         if name == "resolution":
             return "OK", str(round(FULL_STEP_UM / self._settings.microstep_um))
-        if name == "peripheralid":
+        if name in ("peripheralid", "peripheral.id", "peripheral.serial"):
             return "OK", "0"
+        if name == "encoder.count":
+            return "OK", str(round((self._world.carriage_at(t) - self._origin) / ENCODER_COUNT_M))
+        if name == "parking.state":
+            return "OK", str(int(self._parked))
+        if name == "driver.enabled":
+            return "OK", str(int(self._driver_on))
         if name == "motion.busy":
             return "OK", str(int(self.busy(t)))
         if name == "driver.temperature":
