@@ -87,7 +87,7 @@ def claim_rows(claims: Claims) -> list[dict[str, Any]]:
         rows.append(
             blank
             | {
-                "what": f"claim {verdict.claim}",
+                "what": f"claim {verdict.claim}, {verdict.films}",
                 "treatment": verdict.treatment,
                 "holds": "yes" if verdict.holds else "no",
                 "evidence": verdict.evidence,

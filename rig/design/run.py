@@ -23,6 +23,7 @@ from rig.base.outputs import check_new
 from rig.design import best, pictures
 from rig.design import compare as shooting
 from rig.design.claims import Claims, judge
+from rig.design.hypothesis import hypothesis_rows
 from rig.design.output import claim_rows, map_rows, write_csv
 from rig.design.study import BoundaryStudy, MapStudy, OptimiseStudy, ProfilesStudy, Study
 from rig.design.tables import claim_tables, map_table
@@ -273,7 +274,8 @@ def _map(study: MapStudy, path: Path, executor: Executor | None, progress: Progr
             pictures.strokes_and_work(rows, quantity, title, part)
     outcome = Outcome(show=[map_table(rows)])
     if study.claims is not None:
-        outcome.claims = judge(rows)
+        progress(len(rows), len(rows), "as the paper may have computed it")
+        outcome.claims = judge([*rows, *hypothesis_rows(wanted)])
         write_csv(path.with_name(f"{path.name}_claims.csv"), claim_rows(outcome.claims))
         outcome.show += claim_tables(outcome.claims)
     if compare:

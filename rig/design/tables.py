@@ -55,7 +55,10 @@ def claim_tables(claims: Claims) -> list[RenderableType]:
     """The paper's numbers beside ours, its claims, and the reading."""
     numbers = Table(
         title="What the paper prints without pre-stretch, beside the same computed here",
-        caption="At: the a/b of the largest value. *: at the edge of the map, the peak may be beyond.",
+        caption=(
+            "At: the a/b of the largest value; in brackets peak against peak; after the bar ours at the paper's a/b. "
+            "*: at the edge of the map, the peak may be beyond."
+        ),
     )
     numbers.add_column("largest")
     numbers.add_column("paper", justify="right")
@@ -70,17 +73,26 @@ def claim_tables(claims: Claims) -> list[RenderableType]:
         paper = "-" if printed.value is None else f"{scale * printed.value:.3f}"
         paper += "" if printed.radius_ratio is None else f" at {printed.radius_ratio:.2f}"
         numbers.add_row(what + (", both driven" if printed.times == 2 else ""), paper, *cells)
-    judged = Table(title="The paper's claims in each treatment")
-    judged.add_column("claim")
-    for treatment in treatments:
-        judged.add_column(NAMES[treatment])
-    for claim in dict.fromkeys(v.claim for v in claims.verdicts):
-        mine = {v.treatment: v for v in claims.verdicts if v.claim == claim}
-        judged.add_row(claim, *("holds" if mine[t].holds else "fails" for t in treatments))
-    return [numbers, judged, *claims.reading()]
+    blocks = []
+    for films in dict.fromkeys(v.films for v in claims.verdicts):
+        judged = Table(title=f"The paper's claims in each treatment, {films}")
+        judged.add_column("claim")
+        block = [v for v in claims.verdicts if v.films == films]
+        some = [t for t in treatments if any(v.treatment == t for v in block)]
+        for treatment in some:
+            judged.add_column(NAMES[treatment])
+        for claim in dict.fromkeys(v.claim for v in block):
+            mine = {v.treatment: v for v in block if v.claim == claim}
+            judged.add_row(claim, *("holds" if mine[t].holds else "fails" for t in some))
+        blocks.append(judged)
+    return [numbers, *blocks, *claims.reading()]
 
 
 def _cell(one: Compared) -> str:
     scale = 1.0 if one.printed.quantity == "stroke" else 1e3
     text = f"{scale * one.value:.3f} at {one.radius_ratio:.2f}{'*' if one.edge else ''}"
-    return text if one.deviation is None else f"{text} ({100 * one.deviation:+.0f} %)"
+    if one.deviation is not None:
+        text += f" ({100 * one.deviation:+.0f} %)"
+    if one.at_printed is not None and one.deviation_at_printed is not None:
+        text += f" | {scale * one.at_printed:.3f} ({100 * one.deviation_at_printed:+.0f} %)"
+    return text
