@@ -47,6 +47,45 @@ os._exit(0)  # its threads never end
 """
 
 
+LINES = """
+import json, os, sys
+from gsv86lib import gsv86
+
+cell = gsv86(sys.argv[1], 230400)
+out = {}
+def done(name, call):
+    try:
+        out[name] = call()
+    except Exception as error:
+        out[name] = f"{type(error).__name__}: {error}"
+
+done("direction", lambda: cell.getDIOdirection(1))
+done("is output", lambda: cell.isDIOgroupOutput(1))
+done("is input", lambda: cell.isDIOgroupInput(1))
+done("type", lambda: cell.getDIOtype(16))
+done("level", lambda: cell.getDIOlevel(1))
+done("high", lambda: cell.isPinHigh(1))
+done("low", lambda: cell.isPinLow(1))
+done("initial", lambda: cell.getDIOinitialLevel(3))
+done("lower", lambda: cell.readLowerDIOthreshold(2))
+done("upper", lambda: cell.readUpperDIOthreshold(2))
+done("temperature", lambda: cell.get1wireTempValue())
+done("no such pin", lambda: cell.getDIOlevel(17))
+print(json.dumps(out), flush=True)
+os._exit(0)
+"""
+
+
+def test_its_digital_lines(serve):
+    served = serve("force")
+    out = served.client(LINES, served.server.ports["force"]["port"])
+    assert out["is output"] is False and out["is input"] is True, out
+    assert out["type"] == {"DIOtype": 0, "assignedDMSchannel": 0}
+    assert (out["level"], out["initial"], out["lower"], out["upper"]) == (0, 0, 0.0, 0.0)
+    assert out["high"] is False and out["low"] is True
+    assert out["temperature"] == 23.5 and "GSV_CommunicationException" in out["no such pin"]
+
+
 def test_it_configures_and_streams(serve):
     served = serve("force", force={"noise_fraction": 0.001, "zero_offset_mV_per_V": 0.4})
     out = served.client(TOUR, served.server.ports["force"]["port"])

@@ -40,13 +40,61 @@ TIMEOUT, WRONG_COUNT = 0x5A, 0x5B
 COMMANDS: dict[int, int | None] = {
     0x02: 1, 0x03: 5, 0x06: None, 0x07: None, 0x0A: 1, 0x0C: 1, 0x0F: 1, 0x10: 2, 0x11: 1, 0x12: None,
     0x14: 1, 0x15: 5, 0x1F: 0, 0x23: 0, 0x24: 0, 0x26: 0, 0x27: 4, 0x2B: 0, 0x34: None, 0x3B: 0,
-    0x59: None, 0x5A: None, 0x5B: None, 0x5C: None, 0x5D: None, 0x5E: None, 0x5F: None, 0x60: None,
-    0x61: None, 0x62: None, 0x78: 0, 0x79: None, 0x80: 1, 0x81: 3, 0x8A: 0, 0x8B: 4, 0x9A: 1, 0x9B: 5,
+    0x59: 1, 0x5A: 2, 0x5B: 1, 0x5C: 5, 0x5D: 1, 0x5E: 3, 0x5F: 2, 0x60: 6,
+    0x61: 1, 0x62: 3, 0x78: 0, 0x79: 0, 0x80: 1, 0x81: 3, 0x8A: 0, 0x8B: 4, 0x9A: 1, 0x9B: 5,
     0xA2: 2, 0xA3: 2,
 }  # fmt: skip
 
 BRIDGE_8V75, BRIDGE_5V, BRIDGE_2V5 = 0, 1, 2
 UNIT_MV_PER_V = 0
+
+
+PINS, GROUPS = 16, 4
+TEMPERATURE_C = 23.5  # of the sensor on its one-wire line
+
+
+class DigitalLines:
+    """Digital inputs and outputs: 16 pins in groups of four, with nothing connected to them."""
+
+    def __init__(self) -> None:
+        self.output = [False] * GROUPS
+        self.type = [(0, 0)] * PINS
+        self.level = [0] * PINS
+        self.initial = [0] * PINS
+        self.threshold = [[0.0, 0.0] for _ in range(PINS)]
+
+    def execute(self, code: int, p: bytes) -> tuple[int, bytes]:
+        """One command about pin or group ``p[0]``, counted from 1."""
+        n = p[0] - 1
+        if not 0 <= n < (GROUPS if code in (0x59, 0x5A) else PINS):
+            return BAD_ADDRESS, b""
+        match code:
+            case 0x59:
+                return OK, bytes((not self.output[n],))
+            case 0x5A:
+                self.output[n] = p[1] == 0
+            case 0x5B:
+                kind, channel = self.type[n]
+                return OK, kind.to_bytes(3, "big") + bytes((channel,))
+            case 0x5C:
+                self.type[n] = int.from_bytes(p[1:4], "big"), p[4]
+            case 0x5D:
+                return OK, struct.pack(">H", self.level[n])
+            case 0x5E if self.output[n // GROUPS]:
+                self.level[n] = int(p[1:3] != b"\0\0")
+            case 0x5E:
+                return BAD_DATA, b""  # an input
+            case 0x5F | 0x60 if p[1] > 1:
+                return BAD_ADDRESS, b""
+            case 0x5F:
+                return OK, struct.pack(">f", self.threshold[n][p[1]])
+            case 0x60:
+                (self.threshold[n][p[1]],) = struct.unpack(">f", p[2:])
+            case 0x61:
+                return OK, struct.pack(">H", self.initial[n])
+            case _:
+                self.initial[n] = int(p[1:3] != b"\0\0")
+        return OK, b""
 
 
 class GSV8Truth(LoadCellTruth, LineTruth):
@@ -80,6 +128,7 @@ class GSV8:
         self._wire = wire
         self._rng = rng
         self._cell = settings.channel - 1
+        self.lines = DigitalLines()
         self._buffer = bytearray()
         self._buffer_since = 0.0
         self.saturated = 0
@@ -280,6 +329,10 @@ class GSV8:
                 return OK, b""
             case 0x0A:
                 return OK, b""
+            case 0x79:
+                return OK, struct.pack(">f", TEMPERATURE_C)
+        if 0x59 <= code <= 0x62:
+            return self.lines.execute(code, p)
         return self._channel_command(code, p, t)
 
     def _set_tx_mode(self, index: int, word: int, t: float) -> tuple[int, bytes]:
