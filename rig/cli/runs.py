@@ -25,6 +25,7 @@ def command(
 
     What was read is kept in FOLDER/.dea-rig-runs.sqlite, which may be deleted at any time.
     """
+    from rich import box
     from rich.table import Table
 
     from rig.base.text import printable
@@ -35,14 +36,26 @@ def command(
     _check_date("--until", until)
     entries = runs_in(folder)
     found = chosen(entries, words, specimen=specimen, operator=operator, outcome=outcome, since=since, until=until)
-    table = Table()
-    for heading in ("log", "date (UTC)", "specimen", "operator", "bench", "outcome", "fit", "notes"):
-        table.add_column(heading, overflow="fold")
+    columns: dict[str, list[str]] = {}
     for one in found:
-        notes = "\n".join(text for text in (one.notes, one.problem) if text)
-        date = one.date[:16].replace("T", " ")
-        row = (one.log, date, one.specimen, one.operator, one.bench, one.outcome, one.fit, notes)
-        table.add_row(*(printable(text, keep="\n") for text in row))
+        row = {
+            "log": one.log,
+            "date (UTC)": one.date[:16].replace("T", " "),
+            "specimen": one.specimen,
+            "operator": one.operator,
+            "bench": one.bench,
+            "outcome": one.outcome,
+            "fit": one.fit,
+            "notes": "\n".join(text for text in (one.notes, one.problem) if text),
+        }
+        for heading, text in row.items():
+            columns.setdefault(heading, []).append(printable(text, keep="\n"))
+    filled = {heading: texts for heading, texts in columns.items() if any(texts)}
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in filled:
+        table.add_column(heading, overflow="fold", no_wrap=heading in ("date (UTC)", "bench"))
+    for texts in zip(*filled.values(), strict=True):
+        table.add_row(*texts)
     if found:
         show(table)
     click.echo(f"{len(found)} of {len(entries)} runs in {folder}")
