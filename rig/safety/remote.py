@@ -332,7 +332,7 @@ class RemoteGuard:
         self.setpoint = message["setpoint"]
         self.output_is_safe = message["output_is_safe"]
         self.ramp_duration = message["ramp_duration"]
-        self.given_back, self._found = message["given_back"], message["found"]
+        self.given_back, self._found = message.get("given_back", True), message.get("found", {})
         self.ready = message["ready"]
         self.identity = Identity(*message["identity"])
         self.settings = message["settings"]

@@ -226,6 +226,7 @@ ROWS: dict[int, Row] = {
         "no call in the loops waits; lost and said within a second, NOT SAFE within five, signals work",
         [
             "faults/test_hanging.py::test_nothing_waits_for_a_port_to_send",
+            "faults/test_hanging.py::test_neither_loop_makes_a_call_that_could_wait",
             "faults/test_hanging.py::test_an_adapter_that_takes_nothing_is_lost_and_said",
             "faults/test_hanging.py::test_signals_work_while_the_adapter_takes_nothing",
             "drivers/links/test_serial_link.py::test_stalled_peer_is_told_within_a_second_instead_of_waited_for",
@@ -268,6 +269,7 @@ ROWS: dict[int, Row] = {
         "--yes never arms them; SIMULATED or REAL PORTS first; no other bench on resuming or in one fit",
         [
             "rig/run/test_what_is_real.py::test_only_pseudo_terminals_that_the_simulation_printed_are_simulated",
+            "rig/run/test_what_is_real.py::test_a_list_of_ports_whose_server_has_ended_is_of_real_ports",
             "rig/run/test_what_is_real.py::test_yes_never_arms_real_ports",
             "rig/run/test_what_is_real.py::test_a_run_is_not_taken_up_on_another_bench",
             "rig/run/test_what_is_real.py::test_logs_of_hardware_and_simulated_ones_are_not_fitted_together",
@@ -283,6 +285,55 @@ ROWS: dict[int, Row] = {
             "faults/test_hanging.py::test_a_bus_full_of_other_frames_delays_nothing",
         ],
     ),
+    30: (
+        "settings of stage and supply that a run changes",
+        "own axis and own bits only; given back as found, also after a kill",
+        [
+            "faults/test_stage_and_laser.py::test_the_stage_gets_back_what_it_lent_and_other_axes_are_left_alone",
+            "faults/test_stage_and_laser.py::test_a_knob_that_was_disabled_stays_so",
+            "faults/test_stage_and_laser.py::test_what_a_killed_run_left_is_given_back_by_the_next_one",
+            "faults/test_processes.py::test_the_stage_gets_back_after_a_kill_what_it_had_lent",
+            "faults/test_load_cell_and_supply.py::test_a_run_arms_the_supplys_own_trip_and_gives_everything_back",
+            "drivers/instruments/test_iseg_edcp.py::"
+            "test_bits_of_the_control_register_that_are_somebody_elses_stay_and_confuse_nobody",
+        ],
+    ),
+    31: (
+        "two stages with one address",
+        "refused before anything moves",
+        ["faults/test_stage_and_laser.py::test_two_stages_with_one_address_are_refused_before_anything_moves"],
+    ),
+    32: (
+        "a load cell that is frozen but for its noise, a torn film",
+        "a force that does not follow the model while the film moves ends the run",
+        [
+            "faults/test_limits.py::test_a_force_that_does_not_follow_the_film_ends_the_run",
+            "faults/test_limits.py::test_a_film_four_times_softer_or_stiffer_than_believed_is_still_a_film",
+        ],
+    ),
+    33: (
+        "program and guard both stopped while the film breaks down",
+        "the supply's own trip, armed with it, takes the output off",
+        ["faults/test_load_cell_and_supply.py::test_armed_the_supply_trips_by_itself_with_nobody_there_to_see_it"],
+    ),
+    34: (
+        "a computer that would go to sleep with voltage on",
+        "kept awake where the system can; said where it cannot; nothing waits for that",
+        [
+            "rig/operator/test_awake.py::test_the_lock_is_held_inside_and_let_go_after",
+            "rig/operator/test_awake.py::test_one_that_hangs_holds_nobody_up",
+            "rig/operator/test_awake.py::test_where_there_is_no_lock_it_is_said_and_the_run_goes_on",
+        ],
+    ),
+    35: (
+        "limits and thresholds that cannot be meant",
+        "what run refuses, check refuses",
+        [
+            "rig/run/test_rehearse.py::test_a_threshold_that_would_not_be_felt_in_time",
+            "rig/run/test_rehearse.py::test_a_limit_that_protects_nothing_needs_to_be_accepted_by_name",
+            "rig/cli/test_mistakes.py::test_what_is_meant_can_be_accepted_by_name",
+        ],
+    ),
 }
 
 
@@ -292,8 +343,8 @@ def names_in(path: str) -> frozenset[str]:
     return frozenset(node.name for node in tree.body if isinstance(node, ast.FunctionDef))
 
 
-def test_there_are_29_rows() -> None:
-    assert sorted(ROWS) == list(range(1, 30))
+def test_there_are_35_rows() -> None:
+    assert sorted(ROWS) == list(range(1, 36))
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row}: {ROWS[row][0]}")

@@ -102,6 +102,7 @@ def check_off(terminal: Terminal, at: float, log: Log) -> None:
 
 
 def test_ctrl_c_ramps_down(terminal: Terminal) -> None:
+    assert b"What cannot be detected from here" in terminal.shown  # said where high voltage is asked for
     at = terminal.type(b"\x03")
     log = terminal.end()
     check_off(terminal, at, log)

@@ -81,6 +81,7 @@ def test_a_changed_driver_is_told_by_the_rerun(recorded, monkeypatch):
 
 
 def test_a_request_left_out_is_told_by_the_rerun(recorded, monkeypatch):
+    monkeypatch.setattr(ZaberStage, "given_back", True)  # and so it is not asked to give anything back
     monkeypatch.setattr(ZaberStage, "close", lambda self: None)
     found = rerun(recorded("no-hv"))
     assert found.exit_code == 1
