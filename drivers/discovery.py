@@ -24,6 +24,7 @@ from drivers.instrument import Instrument
 from drivers.lines import LineSplitter
 from drivers.links.can_link import INTERFACES
 from drivers.links.link import ByteLink, DeviceError, FrameLink
+from drivers.links.slcan_link import is_version
 from drivers.probe import Answered, BusProbe, Clock, Keys, Line, Network, SerialProbe
 from drivers.registry import registered
 from drivers.roles import Identity
@@ -35,8 +36,6 @@ NOBODY = Identity()
 
 FACTORY_BITRATE = 125_000
 """Of iseg modules and of most CANopen transducers."""
-
-_ADAPTER = re.compile(rb"\x07*V[0-9A-Fa-f]{4}")
 
 
 class Bus(NamedTuple):
@@ -168,7 +167,7 @@ def _open_bus(bus: Bus) -> FrameLink:
 def _adapter(line: Line) -> list[Answered]:
     """An slcan adapter: what is on its bus is asked in CAN frames, at the bit rate of the bus."""
     answers = line.ask(b"V\r", LineSplitter(b"\r", 64, {}).feed)
-    if any(_ADAPTER.fullmatch(answer) for answer in answers):
+    if any(is_version(answer.lstrip(b"\x07")) for answer in answers):
         remark = f"A CAN adapter: --bus slcan:{line.port}@125000 asks on its bus, at the bit rate of the bus."
         return [Answered(Identity(), {}, remark, usable=False)]
     return []

@@ -84,7 +84,7 @@ class Decoder:
             if line.startswith((b"z", b"Z")):
                 line = line[1:]
             line = line.lstrip(b"\n")
-            if _VERSION.fullmatch(line) or _TEXT.fullmatch(line):
+            if is_version(line):
                 self.version = line.decode("ascii")
             elif line and (frame := self._frame(line)) is not None:
                 frames.append(frame)
@@ -109,6 +109,11 @@ class Decoder:
         elif line.startswith(b"t") or not line.isascii():
             self.counters["garbage"] += 1
         return None
+
+
+def is_version(line: bytes) -> bool:
+    """Whether a line is what an adapter answers to ``V``."""
+    return bool(_VERSION.fullmatch(line) or _TEXT.fullmatch(line))
 
 
 def encode(frame: CanFrame) -> bytes:

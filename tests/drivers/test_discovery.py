@@ -106,13 +106,13 @@ class Supply:
 class Adapter:
     """An slcan adapter: BEL for what it does not know."""
 
-    def __init__(self) -> None:
-        self.buffer = b""
+    def __init__(self, version: bytes = b"V1013") -> None:
+        self.buffer, self.version = b"", version
 
     def __call__(self, data: bytes) -> bytes:
         self.buffer += data
         *commands, self.buffer = self.buffer.split(b"\r")
-        return b"".join({b"": b"\r", b"V": b"V1013\r"}.get(c.strip(), b"\x07") for c in commands)
+        return b"".join({b"": b"\r", b"V": self.version + b"\r"}.get(c.strip(), b"\x07") for c in commands)
 
 
 def nobody(data: bytes) -> bytes:
@@ -199,8 +199,9 @@ def test_a_switchboard_is_named_and_not_proposed_as_a_supply() -> None:
     assert (found.role, found.scene) == ("", "") and "switchboard" in found.remark
 
 
-def test_a_can_adapter_is_known_and_says_how_its_bus_is_asked() -> None:
-    (found,), _ = look(Adapter())
+@pytest.mark.parametrize("version", [b"V1013", b"ba6b1dd github.com/normaldotcom/canable-fw.git", b"+Board: X\tMCU: Y"])
+def test_a_can_adapter_is_known_and_says_how_its_bus_is_asked(version: bytes) -> None:
+    (found,), _ = look(Adapter(version))
     assert found.role == "" and "--bus slcan:/dev/ttyUSB0@125000" in found.remark
 
 

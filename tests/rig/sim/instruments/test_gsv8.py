@@ -53,7 +53,8 @@ def test_it_streams_by_itself_after_power_up(make_host):
         ("AA 91 0F 01 85", "AA 51 00 00 85"),
         ("AA 90 1F 85", "AA 54 00 00 D8 D3 54 85"),
         ("AA 90 77 85", "AA 50 40 85"),  # unknown
-        ("AA 91 59 01 85", "AA 50 41 85"),  # not implemented
+        ("AA 91 59 01 85", "AA 51 00 01 85"),  # digital lines 1.1 to 1.4 are inputs
+        ("AA 90 06 85", "AA 50 41 85"),  # not implemented
         ("AA 91 8A 01 85", "AA 50 5B 85"),  # wrong number of parameters
         ("AA 91 0C 09 85", "AA 50 51 85"),  # no such channel
         ("AA 91 14 00 85", "AA 50 51 85"),
