@@ -22,9 +22,9 @@ MOST_STEPS = 25
 # the next is the error of the coarser one, some times the error of the finer. Tests hold both factors to the truth.
 NEWTON_FACTOR = 0.3
 LEVEL_FACTOR = 0.5
-CUT_LEVEL_FACTOR = 1.0  # with cuts, which move from one resolution to the next
-# Near loss of convexity a finer resolution gains less, and two may agree by chance: the change before counts as well.
-SOFT_LEVEL_FACTOR = 2.0
+CUT_LEVEL_FACTOR = 2.0  # with cuts, which move from one resolution to the next
+# Near loss of convexity a finer resolution gains less, and of a film that is one cone two may agree by chance: the
+# change before counts as well.
 SOFT_BEFORE_FACTOR = 0.2
 ROUND_OFF = 1e-13
 # Of the meridional stress. A hoop stress below the first will not turn out positive at a finer resolution; one between
@@ -301,6 +301,7 @@ def refine(
     sensitivities: bool = False,
     settle: Settle = newton,
     factor: float = LEVEL_FACTOR,
+    soft: bool = False,
     folded: list[tuple[NDArray[np.intp], Start]] | None = None,
 ) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
     """Solve a block of states to ``tolerance`` (relative, force), each with the resolution that it needs.
@@ -331,7 +332,7 @@ def refine(
         modes = start.grid.table.modes
         if previous is not None:
             error = estimate(lam, previous, result.change, result.tail, tolerance, factor)
-            if factor >= SOFT_LEVEL_FACTOR:
+            if soft:
                 error = error + SOFT_BEFORE_FACTOR * before
             before = np.abs((lam - previous) / lam)
             settled = np.flatnonzero(ok & (error <= tolerance))

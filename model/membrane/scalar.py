@@ -540,7 +540,7 @@ def _refine(solver: Solver, tolerance: float, folds: bool, near: Found | None) -
     goal = refinement.goal(tolerance)
     modes = max(2, refinement.first_modes(solver.film.span, tolerance))
     solver.begin(modes, None if near is None or near.cones else near)
-    previous = math.nan
+    previous, before = math.nan, math.inf
     steps = 0
     while modes <= MOST_MODES:
         for _ in range(MOST_STEPS):
@@ -560,6 +560,9 @@ def _refine(solver: Solver, tolerance: float, folds: bool, near: Found | None) -
             raise NotOrdinary
         factor = refinement.CUT_LEVEL_FACTOR if solver.cones else refinement.LEVEL_FACTOR
         error = refinement.estimate(lam, previous, change, tail, tolerance, factor)
+        if not solver.panels:
+            error += refinement.SOFT_BEFORE_FACTOR * before
+            before = abs((lam - previous) / lam) if math.isfinite(previous) else math.inf
         if error <= tolerance:
             answer = found(solver, lam, error, steps)
             if not folds or (solver.cones and solver.admissible(tolerance)):

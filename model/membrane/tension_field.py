@@ -329,7 +329,6 @@ def _round(
     """Cut the elements where the zones of ``start`` end, and solve; other zones than before: once more (``again``)."""
     here = problem.take(index)
     settler = partial(settle, kind=SoftCones, careful=True) if careful else settle
-    factor = refinement.SOFT_LEVEL_FACTOR if careful else refinement.CUT_LEVEL_FACTOR
     state = start.state
     mixed: NDArray[np.bool_] = np.zeros(len(index), dtype=np.bool_)
     if state.relaxed is not None:
@@ -356,7 +355,13 @@ def _round(
                     grid.take(here_of), chosen.take(here_of), at.log[1][..., here_of], breaks, cut.modes, wrinkled
                 )
                 done, missed, spent = refinement.refine(
-                    film, tolerance, begun, sensitivities=sensitivities, settle=settler, factor=factor
+                    film,
+                    tolerance,
+                    begun,
+                    sensitivities=sensitivities,
+                    settle=settler,
+                    factor=refinement.CUT_LEVEL_FACTOR,
+                    soft=careful or bool(wrinkled.all()),
                 )
                 where = index[some[here_of]]
                 lost.append(where[missed])
