@@ -7,7 +7,6 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +60,8 @@ def read_ports(path: Path | None) -> dict[str, dict[str, Any]] | None:
         raise ConfigError(f"{path}: not the JSON that `dea-rig sim` prints: a table of ports by role is needed.")
     known = ("stage", "force", "displacement", "hv")
     if unknown := sorted(ports.keys() - {*known, "served_by"}):
+        from difflib import get_close_matches
+
         near = get_close_matches(unknown[0], known, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise ConfigError(f"{path}: {unknown[0]!r} is no role; roles are {', '.join(known)}.{hint}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,6 +64,8 @@ def command(
     if preset is None:
         preset = "parker" if yes else click.prompt("Film", type=click.Choice(list(PRESETS)), default="parker")
     if preset not in PRESETS:
+        from difflib import get_close_matches
+
         near = get_close_matches(preset, list(PRESETS), n=1, cutoff=0.5)
         hint = f" Did you mean {near[0]}?" if near else ""
         raise ConfigError(f"--preset {preset}: there is no such film; there are {', '.join(PRESETS)}.{hint}")
