@@ -103,3 +103,15 @@ def test_forces_at_three_tolerances_agree_within_what_they_state(
         for one in found[:2]:
             off = abs(float(one.force / found[2].force) - 1.0)
             assert off <= float(one.error_estimate + found[2].error_estimate)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lp", [1.0, 1.2, 1.5, 2.0, 2.5, 3.0])
+@pytest.mark.parametrize("name", sorted(NAMED))
+def test_a_sweep_to_slack_has_few_statuses_and_no_hole(name: str, lp: float) -> None:
+    film = Specimen(4e-3, 20e-3, 40e-6, lp, NAMED[name])
+    voltage = np.linspace(0.0, float(slack_voltage(film, np.array(10e-3))), 240)
+    found = solve_many(film, 10e-3, voltage, tolerance=1e-6, wrinkling="tension_field")
+    order = runs(found.status)
+    assert len(order) <= 4, order
+    assert "NOT_CONVERGED" not in order, order
