@@ -73,34 +73,6 @@ def margin(problem: Problem, found: Stations) -> Array:
     return _least(found.log1, stiffness(problem, found))
 
 
-FAN = (0.25, 0.5, 0.75, 1.0, 1.1)  # of the way from the pre-stretched film to a point, and somewhat beyond
-CLEAR = 0.05  # of what the determinant is without Maxwell stress
-
-
-def clear(problem: Problem, grid: Grid, state: State, lam: Array) -> NDArray[np.bool_]:
-    """Whether ``W*(l1, l2)`` is convex in both stretches over all that lies between rest and the film's points.
-
-    The energy is an integral of W* over ``l1 = |d(r, z)/dR| lp`` and ``l2 = r/R lp``. Where W* is convex in both and
-    rises with the first it is convex in (r, z), and has one minimum: at this voltage, and at every lower one, since the
-    Maxwell stress enters in proportion. The state is then on the branch from rest, and the only one so far out.
-    """
-    at = evaluate(problem, grid, state)
-    edge = edges(problem, grid, state, at, lam)
-    states = len(lam)
-    share = np.array(FAN)[:, None, None]
-
-    def fan(inside: Array, ends: Array) -> Array:
-        far = np.concatenate((inside.reshape(-1, states), ends)) - problem.log_prestretch
-        return problem.log_prestretch + share * far
-
-    law = stress(problem.film, stack(fan(at.log[0], edge.log1), fan(at.log[1], edge.log2)))
-    rest = 0.0 if law.maxwell is None else law.maxwell
-    along, around = law.h11 - law.t1, law.h22 - law.t2
-    bare = (along + rest) * (around + rest)
-    convex = (along > 0.0) & (around > 0.0) & (along * around - law.h12 * law.h12 > CLEAR * bare) & (law.t1 >= 0.0)
-    return np.asarray(convex.all(axis=(0, 1)))
-
-
 SHARES = (0.0, 0.5, 1.0)  # of the radial displacement
 SAFE = 0.96  # of the coupling that would make the energy flat
 

@@ -23,7 +23,6 @@ SOFT = 0.1  # stiffness below which a path that ends has met the loss of convexi
 CHECK_MODES = 6  # of a way that is only looked at
 WAY = (2, 5)  # steps of V^2 to an answer that is there already: so many, and then so many
 WAY_GOAL, WAY_STEPS = 3e-2, 8  # of Newton on that way
-LOOSE = 1e-5  # tolerance beyond which the cuts of a soft state stand too far off
 ROUGH = 1e-6  # tolerance on the way
 
 
@@ -69,14 +68,6 @@ def solve(problem: Problem, tolerance: float, *, relaxed: bool, sensitivities: b
             answer.index = one[answer.index]
             answers.append(_convex(problem, answer))
     return answers, ended
-
-
-def clear(problem: Problem, end: Start, lam: Array, tolerance: float) -> NDArray[np.bool_]:
-    """Whether wrinkled states are on the branch from rest by their energy, with all their zones."""
-    if tolerance > LOOSE:
-        return np.zeros(len(lam), dtype=np.bool_)
-    good = tension_field.complete(problem, end.grid, end.state, tolerance)
-    return good & convexity.clear(problem, end.grid, end.state, lam)
 
 
 def connected(problem: Problem, end: Start, lam: Array) -> NDArray[np.bool_]:

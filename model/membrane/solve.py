@@ -14,9 +14,10 @@ from model.arrays import Array
 from model.material.law import Evaluations, Film, stack, stress
 from model.material.materials import EPSILON_0
 from model.membrane import from_rest, ritz, scalar, tension_field
+from model.membrane.flat import Flat, Solved
 from model.membrane.profile import Profile, dense, profile
 from model.membrane.refinement import ROUND_OFF_TENSION, Answer, Start, groups, prolonged, refine
-from model.membrane.ritz import LONGEST, Grid, Problem, State
+from model.membrane.ritz import LONGEST, Grid, Problem
 from model.membrane.scalar_state import Film as OneFilm
 from model.membrane.scalar_state import Found, slack
 from model.membrane.solution import Solutions, Status
@@ -25,7 +26,6 @@ from model.specimen import Specimen
 __all__ = ["Solution", "Solutions", "Status", "Wrinkling", "profiles", "solve", "solve_many"]
 
 Wrinkling = Literal["plain", "tension_field"]
-Solved = tuple[Problem, Grid, State, Array]  # states, and their force over its unit
 BLOCK = 1024  # states solved together: their arrays stay in the processor's cache
 # Where the voltage takes more than this share of the meridional stiffness, other branches may be near: such a state is
 # followed from rest.
@@ -255,7 +255,7 @@ def _quick(
         found = scalar.solve(film, tolerance, count, folds=folds)
     if found is None or found.meridional <= 0.0:
         return None
-    if found.softening > SOFTENING and not _on_branch(specimen, h, voltage, found, count, tolerance):
+    if found.softening > SOFTENING and not _on_branch(specimen, h, voltage, found, count):
         return None
     wrinkled = bool(found.cones) or found.hoop < ROUND_OFF_TENSION * found.meridional
     if wrinkled and slack(film):
@@ -284,17 +284,14 @@ def _quick(
     )
 
 
-def _on_branch(
-    specimen: Specimen, h: float, voltage: float, found: Found, count: Evaluations, tolerance: float
-) -> bool:
-    """Whether an easy state is plainly on the branch from rest; see `_Block.doubtful`."""
+def _on_branch(specimen: Specimen, h: float, voltage: float, found: Found, count: Evaluations) -> bool:
+    """Whether an easy taut state is plainly on the branch from rest; see `_Block.doubtful`."""
+    if found.cones:
+        return False
     with np.errstate(all="ignore"):
         problem = _Block(_Inputs.gather(specimen, h, voltage), np.zeros(1, dtype=np.intp), count).problem
-        grid, state = found.arrays()
-        lam = np.array([found.lam])
-        if found.cones:
-            return bool(from_rest.clear(problem, Start(grid, state), lam, tolerance)[0])
-        return bool(from_rest.connected(problem, prolonged(Start(grid, state), from_rest.CHECK_MODES), lam)[0])
+        end = prolonged(Start(*found.arrays()), from_rest.CHECK_MODES)
+        return bool(from_rest.connected(problem, end, np.array([found.lam]))[0])
 
 
 def _solve(
@@ -302,7 +299,7 @@ def _solve(
 ) -> tuple[Solutions, list[tuple[NDArray[np.intp], Solved]]]:
     """The solutions, and with ``keep`` the states themselves."""
     _check(tolerance, wrinkling)
-    result = _Flat(
+    result = Flat(
         len(inputs.h),
         max((len(s.material.mu) for s in inputs.specimens), default=1),
         max((len(s.material.alpha) for s in inputs.specimens), default=1),
@@ -363,47 +360,6 @@ def solve(
     )
 
 
-class _Flat:
-    """The results while they are being filled, one entry a state."""
-
-    def __init__(self, states: int, moduli: int, shapes: int, sensitivities: bool, keep: bool) -> None:
-        self.real = {
-            name: np.full(states, np.nan)
-            for name in (
-                "force",
-                "peak_field",
-                "peak_field_radius",
-                "min_hoop_stress",
-                "min_meridional_stress",
-                "max_stretch",
-                "error_estimate",
-            )
-        }
-        self.whole = {name: np.zeros(states, dtype=np.intp) for name in ("iterations", "modes")}
-        self.flag = {
-            name: np.zeros(states, dtype=np.bool_) for name in ("stable", "field_exceeded", "stretch_exceeded")
-        }
-        self.status = np.full(states, Status.INVALID, dtype=np.int8)
-        self.dforce: dict[str, Array] | None = None
-        self.keep = keep
-        self.kept: list[tuple[NDArray[np.intp], Solved]] = []
-        if sensitivities:
-            names = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
-            self.dforce = {name: np.full(states, np.nan) for name in names}
-            self.dforce |= {"mu": np.full((states, moduli), np.nan), "alpha": np.full((states, shapes), np.nan)}
-
-    def solutions(self, shape: tuple[int, ...], count: Evaluations) -> Solutions:
-        dforce = None
-        if self.dforce is not None:
-            dforce = {name: values.reshape(shape + values.shape[1:]) for name, values in self.dforce.items()}
-        return Solutions(
-            **{name: values.reshape(shape) for name, values in (self.real | self.whole | self.flag).items()},
-            status=self.status.reshape(shape),
-            dforce=dforce,
-            evaluations=count,
-        )
-
-
 class _Block:
     """Some of the states, in dimensionless form, and the way back to SI."""
 
@@ -444,7 +400,7 @@ class _Block:
         height = np.where(self.h == 0.0, 1e-9, np.abs(self.h) / self.b)
         self.problem = Problem(film, np.log(self.lp), np.log(self.b / self.a), height)
 
-    def solve(self, result: _Flat, tolerance: float, wrinkling: Wrinkling, sensitivities: bool) -> None:
+    def solve(self, result: Flat, tolerance: float, wrinkling: Wrinkling, sensitivities: bool) -> None:
         """Solve the block and write what comes out."""
         index, problem = np.arange(len(self.index)), self.problem
         if problem.span.max() > WIDEST:
@@ -484,7 +440,7 @@ class _Block:
         doubtful = [] if relaxed else [lost]
         none = [np.zeros(len(answer.index), dtype=np.bool_) for answer in answers]
         folds = [x.hoop < ROUND_OFF_TENSION * x.meridional for x in (a.extremes for a in answers)] if relaxed else none
-        for answer, wrinkled, soft in zip(answers, folds, self.doubtful(index, answers, folds, tolerance), strict=True):
+        for answer, wrinkled, soft in zip(answers, folds, self.doubtful(index, answers, folds), strict=True):
             doubtful.append(answer.index[soft & ~wrinkled])
             if wrinkled.any():
                 folded.append((answer.index[wrinkled], Start(answer.grid, answer.state).take(wrinkled)))
@@ -499,7 +455,7 @@ class _Block:
                 for answer in answers:
                     answer.index = some[answer.index]
                 none = [np.zeros(len(answer.index), dtype=np.bool_) for answer in answers]
-                for answer, soft in zip(answers, self.doubtful(index, answers, none, tolerance), strict=True):
+                for answer, soft in zip(answers, self.doubtful(index, answers, none), strict=True):
                     doubtful.append(answer.index[soft])
                     self.place(result, index, answer, ~soft)
                 return some[lost]
@@ -517,7 +473,6 @@ class _Block:
         index: NDArray[np.intp],
         answers: list[Answer],
         others: list[NDArray[np.bool_]],
-        tolerance: float,
     ) -> list[NDArray[np.bool_]]:
         """Which answers may not be on the branch from rest; ``others`` are not asked about."""
         soft: list[NDArray[np.bool_]] = []
@@ -527,14 +482,8 @@ class _Block:
             these = (x.softening > SOFTENING) | (x.meridional <= 0.0)
             soft.append(these)
             asked = np.flatnonzero(these & (x.meridional > 0.0) & ~other)
-            if len(asked) == 0:
-                continue
-            part = answer.take(asked)
-            if part.state.relaxed is None:
-                taut.append((these, asked, part))
-            else:
-                problem = self.problem.take(index[part.index])
-                these[asked] = ~from_rest.clear(problem, Start(part.grid, part.state), part.lam, tolerance)
+            if len(asked) and answer.state.relaxed is None:  # soft wrinkled ones are followed, every one
+                taut.append((these, asked, answer.take(asked)))
         if taut:
             end = Start.join([prolonged(Start(part.grid, part.state), from_rest.CHECK_MODES) for _, _, part in taut])
             which = np.concatenate([part.index for _, _, part in taut])
@@ -547,7 +496,7 @@ class _Block:
 
     def follow(
         self,
-        result: _Flat,
+        result: Flat,
         index: NDArray[np.intp],
         problem: Problem,
         some: NDArray[np.intp],
@@ -574,7 +523,7 @@ class _Block:
         tension: Array = stress(p.film, stack(log, log)).t1
         return tension < 0.0
 
-    def place(self, result: _Flat, index: NDArray[np.intp], answer: Answer, these: NDArray[np.bool_]) -> None:
+    def place(self, result: Flat, index: NDArray[np.intp], answer: Answer, these: NDArray[np.bool_]) -> None:
         """Write ``these`` of an answer's states in SI units; ``index``: the answer's numbers to the block's."""
         if not these.all():
             if not these.any():

@@ -31,7 +31,6 @@ START_MODES = 5
 MOST_ZONES = 5
 ROUNDS = 4
 SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a wrong sign, as it has beside a cut
-THIN = 1e-3  # of `wrong_sign`: beyond it a zone is there
 STEPS, CAREFUL_STEPS = 15, 40  # most of a rung
 CALM = 1e-4  # change of the strains from which a careful solution moves its cuts
 CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
@@ -132,17 +131,6 @@ def zones(grid: Grid, state: State, at: Points, slack: float = 0.0, *, between: 
     x = left + share[place] * (right - left)
     where[rank, columns] = x[0] + part * (x[1] - x[0])
     return Zones(changes, folded[0], where)
-
-
-def complete(problem: Problem, grid: Grid, state: State, tolerance: float) -> NDArray[np.bool_]:
-    """Whether states with cuts have no zone that is still so thin that `wrong_sign` lets it pass.
-
-    Where the tension is a small rest such a zone changes the force by more than its third power.
-    """
-    assert state.relaxed is not None
-    now = zones(grid, state, ritz.evaluate(problem, grid, state), slack=THIN * wrong_sign(tolerance))
-    kinds = state.relaxed[0]
-    return np.asarray((now.changes == (kinds[1:] != kinds[:-1]).sum(axis=0)) & (now.first == kinds[0]))
 
 
 def remap(old: Grid, state: State, natural: Array, breaks: Array, modes: int, wrinkled: NDArray[np.bool_]) -> Start:
