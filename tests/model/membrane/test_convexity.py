@@ -38,6 +38,15 @@ def test_the_statuses_along_the_voltage_change_once() -> None:
     assert np.all(np.diff(found.force[found.answered]) < 0.0)
 
 
+@pytest.mark.parametrize("tolerance", [1e-8, 1e-6, 1e-4])
+def test_between_loss_of_convexity_and_slack_no_voltage_has_an_answer(tolerance: float) -> None:
+    """At 1812.87 V the energy is convex at every point of a state that is there; the branch has ended before."""
+    soft = Specimen(4e-3, 20e-3, 40e-6, 1.2, Material("soft", (8e4,), (2.5,), 2.5))
+    voltage = np.sort(np.append(np.arange(1740.0, 1840.0, 4.0), 1812.872509958235))
+    found = solve_many(soft, 0.003157894736842105, voltage, tolerance=tolerance, wrinkling="tension_field")
+    assert runs(found.status) == ["WRINKLED", "UNSTABLE", "SLACK"]
+
+
 @pytest.mark.parametrize("voltage", [505.0, 522.0, 527.0])
 def test_one_answer_at_every_tolerance_up_to_the_loss_of_convexity(voltage: float) -> None:
     found = [solve(STIFFENING, H, voltage, tolerance=t, wrinkling="tension_field") for t in (1e-4, 1e-6, 1e-8)]
