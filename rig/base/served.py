@@ -104,9 +104,11 @@ def _terminals_in(file: Path) -> list[int]:
 @cache
 def _system_tells() -> bool:
     """Whether the system says of an open descriptor to which pseudo-terminal it is the other end."""
+    if os.name != "posix":
+        return False
     try:
         master, slave = os.openpty()
-    except (OSError, AttributeError):
+    except OSError:
         return False
     try:
         return bool(_terminals_in(Path(f"/proc/self/fdinfo/{master}")))

@@ -98,17 +98,18 @@ Tell = Callable[..., Story]
 def tell(tmp_path: Path) -> Tell:
     """``tell(mischief, replace, scene)`` runs the short protocol on the simulated bench.
 
-    ``mischief(bench, stop)`` is called once, with 1000 V on and the stage moving. ``replace`` is (old, new) in the
-    text of the scene, which is named as among the fixtures. ``meanwhile(now, bench, control)`` is called about five
-    times a second of the run, and as often the story tells the supply's true output. Without ``checked`` the plan is
-    not held against the limits beforehand: what is left is what the rig itself refuses. ``nearer`` shortens the way to
-    the film, 40 mm in the scenes.
+    ``mischief(bench, stop)`` is called once, with 1000 V on and the stage moving. ``replace``, and ``also``, are
+    (old, new) in the text of the scene, which is named as among the fixtures. ``meanwhile(now, bench, control)`` is
+    called about five times a second of the run, and as often the story tells the supply's true output. Without
+    ``checked`` the plan is not held against the limits beforehand: what is left is what the rig itself refuses.
+    ``nearer`` shortens the way to the film, 40 mm in the scenes.
     """
 
     def run(
         mischief: Mischief | None = None,
         *,
         replace: tuple[str, str] | None = None,
+        also: tuple[str, str] | None = None,
         scene: str = "cone-4mm",
         meanwhile: Meanwhile | None = None,
         protocol: str = PROTOCOL,
@@ -120,9 +121,10 @@ def tell(tmp_path: Path) -> Tell:
         nearer: bool = True,
     ) -> Story:
         text = (SCENES / f"{scene}.toml").read_text()
-        if replace is not None:
-            assert replace[0] in text
-            text = text.replace(*replace)
+        for pair in (replace, also):
+            if pair is not None:
+                assert pair[0] in text
+                text = text.replace(*pair)
         for far, near in NEARER.items() if nearer else ():
             text = text.replace(far, near)
         parsed = parse_table(text, Scene, "scene", "test")

@@ -82,7 +82,7 @@ class Rig(RuleBasedStateMachine):
             assert self.guard.state is GuardState.ARMED
         if begin == "live":
             self.voltage(1000.0)
-            self.tick(18)
+            self.tick(20)
             assert self.output == pytest.approx(1000.0, rel=1e-3)
 
     def start(self) -> None:

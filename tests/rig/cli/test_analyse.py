@@ -24,6 +24,10 @@ def numbers(folder: Path, name: str, text: str) -> dict[str, object]:
     done = call(table, "-o", out)
     assert done.exit_code == 0, done.output
     found: dict[str, object] = json.loads(out.read_text(encoding="utf-8"))
+    specimens = found["specimens"]
+    assert isinstance(specimens, list)
+    for number, one in enumerate(specimens, 1):  # without a name of its own it has the file's
+        assert one.pop("specimen") == f"{table}, specimen {number}"
     return found
 
 
