@@ -191,12 +191,18 @@ def measure(stand: Stand, row: Row, instant: float | None, rng: random.Random) -
     """One run with one trouble: at ``instant`` seconds after its start, or at random while it is live."""
     run = stand.start()
     if instant is None:
-        stand.wait_until_live(run)
+        try:
+            stand.wait_until_live(run)
+        except RigError:  # the guard of a run killed in its first moments may still have the port
+            row.without += 1
+            stand.wait_until_alone(run)
+            return run
         instant = stand.bench.clock.now() - run.began + rng.uniform(0.0, 1.0)
     due = run.began + instant
     stand.wait(lambda: stand.bench.clock.now() >= due or run.status is not None, "the instant")
     if run.status is not None:  # it was faster this time
         row.without += 1
+        stand.wait_until_alone(run)
         return run
     what = row.what.removesuffix(FLOODED)
     pid = run.guard if what in (GUARD, GUARD_STOPPED) else run.engine
