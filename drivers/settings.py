@@ -80,7 +80,7 @@ class InstrumentSettings(Table):
 
     def open_shared(self, names: Sequence[str]) -> Sequence[ByteLink]:
         """As `open`, one link for each of the instruments called ``names``, over one connection."""
-        raise NotImplementedError
+        raise NotImplementedError  # each kind of link has its own
 
     @property
     def two_may_hold(self) -> bool:
@@ -97,7 +97,7 @@ class InstrumentSettings(Table):
         drivers.links.link.DeviceError
             It cannot be opened, or somebody else has it.
         """
-        raise NotImplementedError
+        raise NotImplementedError  # each kind of link has its own
 
 
 class SerialSettings(InstrumentSettings):

@@ -300,10 +300,10 @@ class AsciiStream(Generic[S]):
             )
 
     def _scale_in_words(self) -> dict[str, str]:
-        raise NotImplementedError
+        raise NotImplementedError  # each quantity has its own, below
 
     def _sample(self, t: float, value: float, flags: SampleFlag) -> S:
-        raise NotImplementedError
+        raise NotImplementedError  # each quantity has its own, below
 
 
 class AsciiForce(AsciiStream[ForceSample]):

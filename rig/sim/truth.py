@@ -82,7 +82,7 @@ class InstrumentTruth(Table):
 
     def wire(self) -> ByteWire | FrameWire:
         """The wire between it and the host."""
-        raise NotImplementedError
+        raise NotImplementedError  # each kind of wire has its own
 
 
 class LinkTruth(Table):

@@ -103,7 +103,7 @@ class AnalogInput(Generic[S]):
         self._samples.append(self._sample(t, volts, flags))
 
     def _sample(self, t: float, volts: float, flags: SampleFlag) -> S:
-        raise NotImplementedError
+        raise NotImplementedError  # each quantity has its own, below
 
 
 class AnalogForce(AnalogInput[ForceSample]):
