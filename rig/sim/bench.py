@@ -94,8 +94,8 @@ class SimulatedBench:
         self.instruments[role] = twin.make(truth, self.world, wire, self._rng(role))
 
     def prepare(self) -> None:
-        """Do now what takes long (the film's table), so that nothing waits for it later."""
-        _ = self.world.film
+        """Do now what takes long (the film's tables), so that nothing waits for it later."""
+        self.world.prepare()
 
     def wire(self, role: str) -> ByteWire | FrameWire:
         """The wire to the instrument of ``role``; the host uses its ``host_write`` and ``host_read``."""

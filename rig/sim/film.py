@@ -79,7 +79,7 @@ def _free_field(specimen: Specimen, h: Floats, voltage: Floats) -> Floats:
     return np.where(free >= needed * (1.0 - 1e-6), voltage * area / specimen.thickness, np.nan)
 
 
-def _clenshaw(coefficients: list[float], x: float) -> float:
+def clenshaw(coefficients: list[float], x: float) -> float:
     """Sum of c_k T_k(2 x - 1)."""
     y = 4.0 * x - 2.0
     b1 = b2 = 0.0
@@ -117,11 +117,11 @@ class FilmTable:
         w = self._w(s)
         u = 0.0
         if self._bound:
-            ratio = voltage / _clenshaw(self._bound, w)
+            ratio = voltage / clenshaw(self._bound, w)
             u = min(ratio * ratio, self._beyond)
         if self._edge and voltage >= (edge := self._at(self._edge, s)) and edge < self._at(self._breakdown, s):
             return 0.0  # slack
-        return s * _clenshaw([_clenshaw(column, w) for column in self._columns], u)
+        return s * clenshaw([clenshaw(column, w) for column in self._columns], u)
 
     def breakdown_voltage(self, s: float) -> float:
         """Voltage (V) at which the film breaks down at indentation ``s`` (m): by its field, or by pull-in before."""
@@ -129,7 +129,7 @@ class FilmTable:
 
     def bound(self, s: float) -> float:
         """Largest voltage (V) of the table's nodes at indentation ``s`` (m)."""
-        return _clenshaw(self._bound, self._w(s)) if self._bound else 0.0
+        return clenshaw(self._bound, self._w(s)) if self._bound else 0.0
 
     def top(self, s: float) -> float:
         """Largest voltage (V) that the table is good for at indentation ``s`` (m): the film is taut up to there."""
@@ -143,7 +143,7 @@ class FilmTable:
         return values[i] + (x - i) * (values[i + 1] - values[i])
 
 
-def _nodes(n: int) -> Floats:
+def nodes(n: int) -> Floats:
     """Chebyshev nodes of the first kind on (0, 1)."""
     nodes: Floats = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / n)
     return nodes
@@ -158,7 +158,7 @@ def _series(values: Floats) -> Floats:
     return coefficients
 
 
-def _columns(values: Floats) -> list[list[float]]:
+def columns(values: Floats) -> list[list[float]]:
     """Chebyshev coefficients from values at the nodes (n_w, n_u), a list in w for each in u."""
     columns: list[list[float]] = _series(_series(values).T).tolist()
     return columns
@@ -174,7 +174,7 @@ def tabulate(specimen: Specimen, compliance: float, with_voltage: bool, solve: S
     largest = float(solve(specimen, np.array([reach]), np.zeros(1))[0][0])
     best = bare
     for n_w, n_u in SIZES[:1] if bare._edge else SIZES:  # more nodes do not follow kinks better
-        table = _fit(specimen, compliance, bare, _nodes(n_w), _nodes(n_u if with_voltage else 1), solve)
+        table = _fit(specimen, compliance, bare, nodes(n_w), nodes(n_u if with_voltage else 1), solve)
         best = min(best, table, key=lambda one: one.error)
         if best.error <= TOLERANCE * largest:
             return best
@@ -277,13 +277,13 @@ def _fit(specimen: Specimen, compliance: float, bare: FilmTable, w: Floats, u: F
     if not found.all():
         i, j = np.argwhere(~found)[0]
         raise FilmTableError(f"no membrane solution for the film at {s[i] * 1e3:.4g} mm and {voltage[i, j]:.4g} V")
-    table = replace(bare, _columns=_columns(force / s[:, None]))
+    table = replace(bare, _columns=columns(force / s[:, None]))
     if compliance > 0:
         shared = [
             [_shared(table, compliance, one, v) for v in row]
             for one, row in zip(s.tolist(), voltage.tolist(), strict=True)
         ]
-        table = replace(bare, _columns=_columns(np.array(shared) / s[:, None]))
+        table = replace(bare, _columns=columns(np.array(shared) / s[:, None]))
     return replace(table, error=_check(specimen, table, compliance, w, u, solve))
 
 

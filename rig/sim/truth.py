@@ -159,6 +159,19 @@ class OutputTruth(InstrumentTruth):
         default=0.0, description="Hidden relative error of set-point and monitor together. Typical: +-0.01."
     )
     film_capacitance_nF: NotNegative = Field(default=0.7, description="Capacitance that the supply charges (nF).")
+    capacitance_of_film: bool = Field(
+        default=False,
+        description="Whether the supply charges the capacitance of the deformed film, by its shape and permittivity; "
+        "film_capacitance_nF then counts for nothing.",
+    )
+    beside_film_nF: NotNegative = Field(
+        default=0.0,
+        description="Capacitance of cable and output that is charged with the film's (nF), with "
+        "capacitance_of_film only.",
+    )
+    current_gain_error: float = Field(
+        default=0.0, description="Hidden relative error of the current monitor. Typical: +-0.01."
+    )
     leakage_resistance_GOhm: Positive = Field(default=20.0, description="Resistance of the film, in order (GOhm).")
     arc_resistance_kOhm: Positive = Field(
         default=10.0, description="Resistance of the film once it has broken down (kOhm)."

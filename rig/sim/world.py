@@ -13,12 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from model.specimen import Specimen
+from rig.sim.electrodes import Electrodes, electrodes
 from rig.sim.film import FilmTable, Solve, solve_membrane, tabulate
 from rig.sim.path import Path
 from rig.sim.truth import OutputTruth, RigTruth, StageTruth
 
 Floats = npt.NDArray[np.float64]
 
+CHARGE_S = 1e-4  # to either side of the instant at which a charging current is asked for
 TICK = 0.01  # s; the film's relaxation is integrated, and its strength checked, on this grid
 
 
@@ -84,6 +86,7 @@ class World:
         self.dummy_at = math.inf
         self.weight = 0.0
         self._table: FilmTable | None = None
+        self._capacitance: Electrodes | None = None
         self._branches = [(b.modulus_ratio, b.time_s) for b in rig.film.maxwell]
         self._overstress = [0.0] * len(self._branches)
         self._elastic = 0.0  # F_e at the last tick
@@ -187,7 +190,40 @@ class World:
             return 0.0
         voltage, slope = self.output.at(t)
         extra = self.extra_leakage if voltage > 0 else 0.0
-        return self._electrodes.film_capacitance_nF * 1e-9 * slope + voltage / self.film_resistance + extra
+        return self._charging(self._electrodes, t, slope) + voltage / self.film_resistance + extra
+
+    def _charging(self, electrodes: OutputTruth, t: float, slope: float) -> float:
+        """dQ/dt (A), Q = C V: also of a film that is moved at a constant voltage."""
+        if not electrodes.capacitance_of_film:
+            return electrodes.film_capacitance_nF * 1e-9 * slope
+        return (self.charge(t + CHARGE_S) - self.charge(t - CHARGE_S)) / (2.0 * CHARGE_S)
+
+    def charge(self, t: float) -> float:
+        """Charge (C) on the film and on what is beside it."""
+        voltage = self.output.at(t)[0]
+        return self.capacitance(t) * voltage if voltage else 0.0
+
+    def capacitance(self, t: float) -> float:
+        """What the supply charges (F)."""
+        hv = self._electrodes
+        if hv is None:
+            return 0.0
+        if not hv.capacitance_of_film:
+            return hv.film_capacitance_nF * 1e-9
+        if self._capacitance is None:
+            self._capacitance = electrodes(self.specimen, self.compliance)
+        beside = hv.beside_film_nF * 1e-9
+        return (
+            beside
+            if self.torn
+            else beside + self._capacitance.capacitance(self.indentation_at(t), self.output.at(t)[0])
+        )
+
+    def prepare(self) -> None:
+        """Make now the tables that take long."""
+        _ = self.film
+        if self._electrodes is not None and self._electrodes.capacitance_of_film:
+            self._capacitance = electrodes(self.specimen, self.compliance)
 
     @property
     def next_time(self) -> float:

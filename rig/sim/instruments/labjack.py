@@ -403,7 +403,7 @@ class Amplifier:
         slew = self._truth.slew_V_per_us * 1e6
         if target > now:
             charging = max(spare - now / self._world.film_resistance, 1e-9)
-            self._world.output.ramp(t, target, min(slew, charging / max(self._truth.film_capacitance_nF * 1e-9, 1e-12)))
+            self._world.output.ramp(t, target, min(slew, charging / max(self._world.capacitance(t), 1e-12)))
         elif target < now and not self.stuck_on:
             self._world.output.ramp(t, target, min(slew, max(now, 1.0) / self._truth.fall_time_s))
 
@@ -415,7 +415,8 @@ class Amplifier:
             if s.monitor_unplugged:
                 return 0.0
             return math.copysign(self._world.output.at(t)[0], s.gain_V_per_V) / s.monitor_V_per_V
-        return math.copysign(1.0, s.gain_V_per_V) * self._world.current(t) * 1e6 / s.monitor_uA_per_V
+        current = self._world.current(t) * (1.0 + self._truth.current_gain_error)
+        return math.copysign(1.0, s.gain_V_per_V) * current * 1e6 / s.monitor_uA_per_V
 
     def _input(self, channel: int, t: float) -> float:
         if self._rail:
