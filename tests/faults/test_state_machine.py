@@ -353,7 +353,7 @@ def quick_film(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quick_film")
-@pytest.mark.parametrize("examples", [40, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [40, pytest.param(2000, marks=pytest.mark.long)])
 def test_no_order_of_events_breaks_the_rules(examples: int) -> None:
     how = settings(
         max_examples=examples,

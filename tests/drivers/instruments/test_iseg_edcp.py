@@ -887,7 +887,12 @@ def test_statuses_of_many_channels_are_never_mixed_up_by_faults() -> None:
     assert surveys > 10
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_million_faults_on_the_bus_never_become_values() -> None:
-    survive(1_000_000, seed=2)
+@pytest.mark.parametrize(
+    "faults",
+    [
+        pytest.param(100_000, marks=pytest.mark.slow),
+        pytest.param(1_000_000, marks=[pytest.mark.long, pytest.mark.timeout(900)]),
+    ],
+)
+def test_very_many_faults_on_the_bus_never_become_values(faults: int) -> None:
+    survive(faults, seed=2)

@@ -21,7 +21,7 @@ def test_fifty_states_around_loss_of_convexity() -> None:
     assert_agreed(run(50, seed=1, truth=0), 50)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_few_states_around_loss_of_convexity_disagree() -> None:
     """The whole search is a command that takes a day:
     ``python -m model.verification.search --states 20000 --truth 500``.

@@ -161,18 +161,25 @@ def experiment(protocol: Protocol, seed: int) -> list[Curve]:
     return simulated(protocol, scene, certificates_of(scene, SCENE), ONE_TERM, seed)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_in_half_the_time_it_does_tell_as_much(half: proposal.Proposal, whole: proposal.Proposal) -> None:
-    """Scatter about the truth over 100 simulated experiments each is what is stated, and no worse than the sweep's.
+@pytest.mark.parametrize(
+    ("experiments", "known_to"),
+    [
+        pytest.param(20, 0.16, marks=pytest.mark.slow),
+        pytest.param(100, 0.07, marks=[pytest.mark.long, pytest.mark.timeout(600)]),
+    ],
+)
+def test_in_half_the_time_it_does_tell_as_much(
+    half: proposal.Proposal, whole: proposal.Proposal, experiments: int, known_to: float
+) -> None:
+    """Scatter about the truth over simulated experiments is what is stated, and no worse than the sweep's.
 
-    Such a scatter is known to 7 %, the ratio of two to 10 %.
+    Such a scatter is known to 7 % from 100 experiments and to 16 % from 20, the ratio of two to 1.4 times as much.
     """
     scatter, stated = {}, {}
     alarms = 0
     for label, protocol in (("planned", half.planned.protocol), ("sweep", whole.sweep.protocol)):
         errors, uncertainties = [], []
-        for seed in range(100):
+        for seed in range(experiments):
             found = identify(experiment(protocol, seed), terms=1, starts=1)
             alarms += any("the model does not explain the data" in words for words in found.warnings)
             stiffness = found.quantities["stiffness"]
@@ -185,11 +192,11 @@ def test_in_half_the_time_it_does_tell_as_much(half: proposal.Proposal, whole: p
             )
         scatter[label] = np.sqrt(np.mean(np.square(errors), axis=0))
         stated[label] = np.median(uncertainties, axis=0)
-    assert (scatter["planned"] < 1.2 * scatter["sweep"]).all(), scatter
+    assert (scatter["planned"] < (1.0 + 2.0 * math.sqrt(2.0) * known_to) * scatter["sweep"]).all(), scatter
     assert (stated["planned"] <= stated["sweep"]).all(), stated
     for label, found in scatter.items():
-        assert (np.abs(found / stated[label] - 1.0) < 0.2).all(), (scatter, stated)
-    assert alarms <= 6, "a right model is called wrong"
+        assert (np.abs(found / stated[label] - 1.0) < 3.0 * known_to).all(), (scatter, stated)
+    assert alarms <= 0.03 * 2 * experiments + 1, "a right model is called wrong"
 
 
 @pytest.mark.slow

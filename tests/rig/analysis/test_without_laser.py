@@ -12,7 +12,7 @@ from rig.protocol.experiment import prepare
 from rig.run.run import run
 
 FIXTURES = Path(str(files("sim_fixtures")))
-RUNS = 12
+RUNS = 6
 PROTOCOL = """title = "Up and down"
 [[step]]
 do = "home"

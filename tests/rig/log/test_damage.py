@@ -153,7 +153,11 @@ def complete_messages(content: bytes) -> int:
     return count
 
 
-STEPS = [pytest.param(23, id="some"), pytest.param(1, id="all", marks=pytest.mark.slow)]
+STEPS = [
+    pytest.param(23, id="some"),
+    pytest.param(7, id="more", marks=pytest.mark.slow),
+    pytest.param(1, id="all", marks=pytest.mark.long),
+]
 
 
 @pytest.mark.parametrize("step", STEPS)

@@ -142,7 +142,7 @@ def state(recorded, rng):
     return bytes(found) + bytes(rng.choice((0, 0, 700, 4096, 40_000))), confirmed
 
 
-@pytest.mark.parametrize("count", [pytest.param(60, id="60"), pytest.param(600, id="600", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [pytest.param(60, id="60"), pytest.param(600, id="600", marks=pytest.mark.long)])
 def test_power_cuts(recorded, tmp_path, count):
     rng = random.Random(count)
     path = tmp_path / "cut.mcap.part"

@@ -145,10 +145,16 @@ def test_it_must_begin_in_contact(tmp_path, write_bench):
         prepare(scene, protocol)
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_three_cases_at_two_voltages_are_within_two_percent(tmp_path, write_bench):
-    laws = ["spring", "mass", "antagonist"]
+@pytest.mark.parametrize(
+    "laws",
+    [
+        pytest.param(["antagonist"], marks=pytest.mark.slow),
+        pytest.param(["spring", "mass", "antagonist"], marks=pytest.mark.long),
+    ],
+    ids=len,
+)
+def test_cases_at_two_voltages_are_within_two_percent(tmp_path, write_bench, laws):
     scene, protocol = write_bench(tmp_path, laws, [1000.0, 1300.0], average_s=12.0, zero_s=5.0)
     run(prepare(scene, protocol), tmp_path / "log.mcap", nobody)
     found = strokes(tmp_path / "log.mcap")
