@@ -81,6 +81,7 @@ def furthest_ahead(ways: list[Way]) -> float:
     return max(later.end - earlier.x for earlier, later in zip(ways, ways[2:], strict=False))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scene", "accuracy"), [("cone-4mm", 5e-6), ("no-hv", 0.2e-3)])  # by laser, by force alone
 def test_legs_find_contact_where_one_motion_does_and_as_soon(
     tell: Tell, ways: list[Way], monkeypatch: pytest.MonkeyPatch, scene: str, accuracy: float

@@ -15,6 +15,7 @@ from rig.log.reader import read_log
 Tell = Callable[..., Any]  # of conftest.Story
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hours", [1.0, -1.0])
 def test_a_calendar_that_is_set_changes_no_duration_and_is_told(
     tell: Tell, monkeypatch: pytest.MonkeyPatch, hours: float
@@ -32,6 +33,7 @@ def test_a_calendar_that_is_set_changes_no_duration_and_is_told(
     assert np.ptp(np.diff(log.columns("/force/sample")["t_s"])) < 5e-3
 
 
+@pytest.mark.slow
 def test_a_computer_that_was_suspended_with_voltage_on_takes_it_off(
     tell: Tell, monkeypatch: pytest.MonkeyPatch
 ) -> None:

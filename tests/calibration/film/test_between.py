@@ -31,6 +31,7 @@ def test_the_scatter_between_specimens_is_found_on_average() -> None:
     assert np.mean(found) == pytest.approx(9.0, rel=0.08)
 
 
+@pytest.mark.slow
 def test_specimens_are_fitted_alone_and_their_scatter_is_told_from_their_uncertainty(experiment: Experiment) -> None:
     """Three films whose permittivities are 1.6, 1.7 and 1.9; the dimensions exact, so that nothing else scatters."""
     curves = []
@@ -52,6 +53,7 @@ def test_specimens_are_fitted_alone_and_their_scatter_is_told_from_their_uncerta
     assert between({"one": each["film-0"]}, one_batch=False) == {}
 
 
+@pytest.mark.slow
 def test_what_all_share_does_not_average(experiment: Experiment) -> None:
     curves = []
     for number in range(2):

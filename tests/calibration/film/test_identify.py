@@ -193,6 +193,7 @@ def test_zeros_are_found_within_their_priors_and_enter_the_budget(experiment: Ex
     assert found.quantities["eps_r"].budget["force zero"] > 0.0
 
 
+@pytest.mark.slow
 def test_correlated_noise_enlarges_the_uncertainty(experiment: Experiment) -> None:
     """Samples of a filtered load cell are not independent: four of five carry nothing new."""
     curves = experiment(seed=5, guess=ONE_TERM, truth=ONE_TERM, samples=4000)
@@ -346,6 +347,7 @@ def test_a_wrong_disk_radius_is_reported_as_lack_of_fit(experiment: Experiment) 
 # --- what is left out
 
 
+@pytest.mark.slow
 def test_wrinkled_samples_are_excluded_counted_and_do_not_bias(experiment: Experiment) -> None:
     """Without pre-stretch much of the 1500 V curve is wrinkled; what is left must still give the truth."""
     truth = replace(ONE_TERM, eps_r=1.7)

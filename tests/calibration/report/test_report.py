@@ -130,6 +130,7 @@ def pictured(found: Identification, curves: list[Curve]) -> list[tuple[float, fl
     return pairs
 
 
+@pytest.mark.slow
 def test_errors_of_the_rig_that_were_found_have_their_units_and_are_in_the_pictures(
     tmp_path: Path, experiment: Experiment
 ) -> None:
@@ -153,6 +154,7 @@ def test_errors_of_the_rig_that_were_found_have_their_units_and_are_in_the_pictu
     assert f"{lag.value * 1e3:+.3f} ms" in text
 
 
+@pytest.mark.slow
 def test_pictures_show_what_was_fitted_with_the_tension_field(experiment: Experiment) -> None:
     curves = experiment(seed=4, samples=600, truth=ONE_TERM, guess=ONE_TERM, prestretch=1.0, highest=14e-3)
     found = identify(curves, terms=1, starts=1, wrinkling="tension_field")
@@ -181,6 +183,7 @@ def test_a_failure_leaves_the_old_report_and_nothing_else(
         write_report(tmp_path / "none" / "report.html", *small, scene_texts={}, provenance={})
 
 
+@pytest.mark.slow
 def test_without_voltage_the_report_has_no_permittivity(
     tmp_path: Path, small: tuple[Identification, list[Curve]]
 ) -> None:

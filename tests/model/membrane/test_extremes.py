@@ -132,6 +132,7 @@ def grid(ratios: list[float], prestretches: list[float], heights: list[float], v
     return [row[0] for row in rows], np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
 
 
+@pytest.mark.slow
 def test_nothing_goes_unsaid() -> None:
     films, h, v = grid([0.1], [1.0, 1.5], [1e-3, 0.3], [0.0, 0.9, 1.3])
     answered, compared = check(films, h, v, "plain")

@@ -71,6 +71,7 @@ def test_breakdown_needs_a_field() -> None:
         breakdown_voltage(SOFT, 1e-2, -1.0)
 
 
+@pytest.mark.slow
 def test_branch_agrees_with_the_solver_and_turns_at_the_pull_in() -> None:
     branch = vary_voltage(SOFT, 10e-3, 500.0, points=80)
     turn = branch.limit_points[0]
@@ -91,6 +92,7 @@ def test_branch_agrees_with_the_solver_and_turns_at_the_pull_in() -> None:
     assert parabola(top) == pytest.approx(fold, rel=2e-4)
 
 
+@pytest.mark.slow
 def test_pull_in_is_where_answers_end() -> None:
     h = np.array([4e-3, 10e-3, 20e-3])
     limit = pull_in_voltage(SOFT, h)
@@ -114,6 +116,7 @@ def test_no_pull_in_for_a_film_that_slackens_first() -> None:
     np.testing.assert_array_equal(limit.status, Status.SLACK)
 
 
+@pytest.mark.slow
 def test_taut_until_pull_in_is_told() -> None:
     limit = taut_limit(SOFT, 4e-3)
     assert limit.status == Status.UNSTABLE

@@ -93,6 +93,7 @@ def test_half_of_the_longest_stay_without_voltage_comes_at_the_end(half: proposa
     assert voltage == 0.0
 
 
+@pytest.mark.slow
 def test_limits_keep_places_out(tmp_path: Path) -> None:
     text = SCENE.read_text(encoding="utf-8").replace("../calibrations", str(FIXTURES / "calibrations"))
     text = text.replace("force_N = 0.9", "force_N = 0.2").replace("speed_mm_per_s = 5.0", "speed_mm_per_s = 1.0")
@@ -109,6 +110,7 @@ def test_limits_keep_places_out(tmp_path: Path) -> None:
         assert getattr(step, "speed_mm_per_s", 0.0) <= 1.0
 
 
+@pytest.mark.slow
 def test_without_hv_there_is_no_voltage_and_no_permittivity() -> None:
     found = proposal.propose_protocol(FIXTURES / "scenes" / "no-hv.toml", 300.0)
     assert found.wanted == ("stiffness",)

@@ -36,6 +36,7 @@ speed_mm_per_s = 2.0
 """
 
 
+@pytest.mark.slow
 def test_sensors_without_certificate_are_told_and_a_laser_still_measures_the_disk(tmp_path: Path) -> None:
     text = (FIXTURES / "scenes" / "cone-4mm.toml").read_text(encoding="utf-8")
     text = text.replace("../calibrations", (FIXTURES / "calibrations").as_posix())

@@ -51,6 +51,7 @@ def test_check_accepts_what_it_wrote(tmp_path: Path, preset: str) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
+@pytest.mark.slow
 def test_dimensions_are_those_asked_for(tmp_path: Path) -> None:
     options = ("--disk-radius-mm", "5", "--ring-radius-mm", "25", "--prestretch", "3", "--thickness-um", "500")
     scene, _ = load_scene(made(tmp_path / "mine", "vhb-4905", *options, "--name", "left-1") / "scene.toml")

@@ -62,6 +62,7 @@ def check_kept(log, failure, most):
     assert [gap.reason for gap in kept.gaps] == ["the file ends here without its end record"]
 
 
+@pytest.mark.slow
 def test_a_full_disk(tmp_path):
     with small_disk(tmp_path) as folder:
         with pytest.raises(LogError) as failure, LogProcess(folder / "a.mcap") as log:

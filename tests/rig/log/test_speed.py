@@ -8,6 +8,7 @@ import math
 import time
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
@@ -41,6 +42,7 @@ def stock_write():
     writer.finish()
 
 
+@pytest.mark.slow
 def test_a_kilohertz_against_the_stock_package(tmp_path):
     path = tmp_path / "long.mcap"
     marks = [time.process_time()]

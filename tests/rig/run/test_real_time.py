@@ -88,6 +88,7 @@ def test_the_job_end_to_end(scene: Path, ports: Path, tmp_path: Path) -> None:
     assert abs(eps_r["value"] - 1.7) < 4 * eps_r["standard_uncertainty"] < 2 * 1.7
 
 
+@pytest.mark.slow
 def test_without_arm_there_is_no_high_voltage_and_no_log(scene: Path, ports: Path, tmp_path: Path) -> None:
     log = tmp_path / "run.mcap"
     run = dea_rig("run", scene, FIXTURES / "protocols/short.toml", "-o", log, "--ports", ports)

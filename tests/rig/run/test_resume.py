@@ -93,6 +93,7 @@ def kinds(log: Path) -> list[str]:
     return [f"{phase.step} {phase.kind}" for phase in load_run(log).phases]
 
 
+@pytest.mark.slow
 def test_the_rest_is_carried_out_and_fits_together_with_the_beginning(stopped: Path) -> None:
     second = stopped.with_name("second.mcap")
     result = CliRunner().invoke(main, ["resume", str(stopped), "-o", str(second)])

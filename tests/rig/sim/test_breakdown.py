@@ -72,6 +72,7 @@ def test_it_breaks_down_where_a_scan_of_the_model_says(name, h, how):
     assert table(name).breakdown_voltage(h) == pytest.approx(voltage, rel=0.008)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "h"), [(name, h) for name, h, how in CASES if how == BY_FIELD])
 def test_the_field_at_the_rim_is_its_strength_then(name, h):
     field = rim_field(film(name), h, table(name).breakdown_voltage(h))

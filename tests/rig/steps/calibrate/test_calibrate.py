@@ -152,6 +152,7 @@ def test_from_a_scene_to_files_and_from_its_log_again(tmp_path, write_scene, ste
     assert "exists already" in over.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("error", "code", "words"), [(5e-4, 0, "holds"), (2e-2, 1, "DOES NOT AGREE")])
 def test_daily_check_passes_a_good_sensor_and_fails_one_that_has_changed(tmp_path, write_scene, error, code, words):
     scene = write_scene(tmp_path, f"seed = 3\n[simulation.force]\nfull_scale_N = 1.0\ngain_error = {error}\n")
@@ -160,6 +161,7 @@ def test_daily_check_passes_a_good_sensor_and_fails_one_that_has_changed(tmp_pat
     assert words in said.output
 
 
+@pytest.mark.slow
 def test_the_daily_check_of_the_voltage_stands_on_the_voltage_asked_for(tmp_path, write_scene):
     """Not on a mean with the readings without voltage, which a meter never shows as exactly nothing."""
     said = call(
