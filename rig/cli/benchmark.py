@@ -83,10 +83,12 @@ def _safety(full: bool, out: Path, number: int | None) -> None:
 
 
 def _benchmark(run: Callable[..., Any], render: Callable[..., Any], name: str, full: bool, out: Path) -> None:
+    from model.kernel.library import says
     from rig.base.progress import progress
     from rig.cli.show import show
 
     with progress(f"benchmark {name}") as update:
         report = run(full, out, lambda share, what: update(share, 1.0, what))
     show(render(report))
+    click.echo(f"membrane solver: {says()}")
     click.echo(f"written to {out}/")
