@@ -2,62 +2,43 @@ r"""Films that take time: force of a film with viscous branches along a history 
 
 Maxwell branches stand in parallel with the relaxed film (Reese & Govindjee 1998, in logarithmic principal strains).
 Branch k has the share ``ratio`` of the relaxed film's law and the relaxation time ``tau``; of the logarithmic stretches
-``u_i = ln l_i`` a part ``v_i`` is viscous, and only the rest ``w = u - v`` makes stress:
+``u_i = ln l_i`` a part ``v_i`` is viscous, and only the rest ``x = u - v`` makes stress:
 
-.. math:: \sigma_i = S_i(u) + \sum_k \beta_k S_i(w^k) - \varepsilon E^2, \qquad
-          \dot v_i^k = \frac{1}{2 G \tau_k} \left(S_i - \tfrac{1}{3} (S_1 + S_2)\right)(w^k)
+.. math:: \sigma_i = S_i(u) + \sum_k \beta_k S_i(x^k) - \varepsilon E^2, \qquad
+          \dot v_i^k = \frac{1}{2 G \tau_k} \left(S_i - \tfrac{1}{3} (S_1 + S_2)\right)(x^k)
 
 At the start the film is rested in its flat pre-stretched state: ``v = ln lp`` everywhere. At every instant the membrane
-is in equilibrium; ``v`` moves at the quadrature points of `model.membrane.ritz`. An L-stable, stiffly accurate method
-of the fourth order (Hairer & Wanner, Solving Ordinary Differential Equations II, table IV.6.5) takes the steps. A stage
-of it, ``v = v* + g dt dv/dt``, asks at each point for the ``w`` with
+is in equilibrium (`model.membrane.viscous`); steps of time are those of `model.membrane.march`. Where many answers are
+wanted within a step, they are polynomials through a few solved ones.
 
-    w + c P S(w)/(2 G) = u - v*,    c = g dt/tau,    P = [[2/3, -1/3], [-1/3, 2/3]],
-
-which is the gradient of a convex function: with it the stage is an elastic membrane with another energy, and the
-unknowns, Newton's method and the test of stability are those of the elastic film.
+Derivatives come from the same factored matrices: those of the viscous strains are carried from step to step, with the
+steps' lengths held.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import Array
-from model.material.law import Derivatives, Evaluations, Film, Law, stack
+from model.material.materials import Branch
 from model.membrane import refinement, ritz
+from model.membrane.march import Course, Step, Trail, goal, march, unpack
 from model.membrane.output import fine_table
 from model.membrane.refinement import ROUND_OFF_TENSION
-from model.membrane.ritz import Grid, Index, Problem, State
 from model.membrane.solve import Status, solve_many
+from model.membrane.viscous import Films, Instant, balance, slopes
 from model.specimen import Specimen
 
-# The method's coefficients: nodes, matrix, and solution less embedded solution of the third order.
-NODES = (1 / 4, 3 / 4, 11 / 20, 1 / 2, 1.0)
-MATRIX = (
-    (),
-    (1 / 2,),
-    (17 / 50, -1 / 25),
-    (371 / 1360, -137 / 2720, 15 / 544),
-    (25 / 24, -49 / 48, 125 / 16, -85 / 12),
-)
-DIAGONAL = 1 / 4
-DEFECT = (-3 / 16, -27 / 32, 25 / 32, 0.0, 1 / 4)
-
-SAFETY = 0.9  # of the step that the error estimate allows
-LEAST_FACTOR, MOST_FACTOR = 0.2, 4.0  # of the next step over the last
-STEP_SHARE = 0.1  # of the tolerance: error that one step may add, as many steps add up
-EMBEDDED_FACTOR = 0.1  # error of a step over the estimate, which is the embedded method's: held to the truth by tests
-FIRST_SHARE = 0.02  # of a stretch of the history: its first step
-MOST_REJECTED = 40  # steps in a row without success: there is no state
-LEAST_STEP = 1e-5  # of the shorter of a stretch of the history and the shortest relaxation time: the same
-FLAT = 1e-9  # height over ring radius that stands for the flat film
-INNER_STEPS, INNER_CHANGE = 30, 1e-13  # Newton's method for the strain of a branch at a point
 MORE_MODES = 2  # than an elastic film of the same tolerance: the viscous strain is a field of its own
+FEW = 5  # answers within a step that are solved each; of more, so many are solved at first
+MOST_NODES = 65
+CHUNK = 256  # states that are solved at once
+PEAK, HOOP, MERIDIONAL = 1, 2, 3  # rows of an answer, after the force
 
 
 @dataclass(frozen=True)
@@ -72,6 +53,9 @@ class History:
     status : `model.membrane.solve.Status` numbers
     error_estimate : estimated error of the force over the largest force of the history
     steps, rejected : steps of time taken, and tried in vain
+    dforce : derivatives of the force by "mu" (times, moduli), "alpha" (times, shape parameters), "eps_r" (times,),
+        "ratio", "time" (times, branches), "thickness", "prestretch", and "h", a shift of the whole history of
+        displacement; None unless asked for
     """
 
     force: Array
@@ -82,209 +66,7 @@ class History:
     error_estimate: Array
     steps: int
     rejected: int
-
-
-class _Stage:
-    """The law of a film with branches whose viscous strain follows an implicit stage; stands in for a `Law`.
-
-    law : of the relaxed film, moduli in units of G
-    start : ``v*`` of every branch at the points, (2, K, Q, M, S)
-    ratio, lag : ``beta`` and ``c``, (K, 1, 1, 1)
-    """
-
-    def __init__(self, law: Law, start: Array, ratio: Array, lag: Array) -> None:
-        self.law, self.start, self.ratio, self.lag = law, start, ratio, lag
-        self.elastic = np.empty(0)  # w at the last evaluation, to begin the next one with
-
-    def take(self, index: Index) -> Self:
-        """The law of the states at ``index``."""
-        return type(self)(self.law.take(index), self.start[..., index], self.ratio, self.lag)
-
-    def branch(self, log: Array) -> tuple[Array, Derivatives]:
-        """Elastic strains ``w`` (2, K, ...) of the branches at log stretches (3, ...), and the law there."""
-        total = log[:2, None] - self.start
-        half = 0.5 * self.lag
-        w = self.elastic if self.elastic.shape == total.shape else total / (1.0 + self.lag)
-        for _ in range(INNER_STEPS):
-            found = self.law.derivatives(stack(w[0], w[1]))
-            s1, s2, h11, h12, h22 = found
-            if not self.lag.any():
-                return total, self.law.derivatives(stack(total[0], total[1]))
-            r1 = total[0] - w[0] - half * (2.0 * s1 - s2) / 3.0
-            r2 = total[1] - w[1] - half * (2.0 * s2 - s1) / 3.0
-            a11, a12 = 1.0 + half * (2.0 * h11 - h12) / 3.0, half * (2.0 * h12 - h22) / 3.0
-            a21, a22 = half * (2.0 * h12 - h11) / 3.0, 1.0 + half * (2.0 * h22 - h12) / 3.0
-            over = 1.0 / (a11 * a22 - a12 * a21)
-            change = np.array(((a22 * r1 - a12 * r2) * over, (a11 * r2 - a21 * r1) * over))
-            size = float(np.abs(change).max(initial=0.0))
-            w = w + (change if size < 0.5 else np.clip(change, -0.5, 0.5))
-            if not size > INNER_CHANGE:
-                break
-        self.elastic = w
-        return w, self.law.derivatives(stack(w[0], w[1]))
-
-    def derivatives(self, log: Array) -> Derivatives:
-        """As `Law.derivatives`, of the film with its branches."""
-        t1, t2, h11, h12, h22 = self.law.derivatives(log)
-        _, (s1, s2, c11, c12, c22) = self.branch(log)
-        half = 0.5 * self.lag
-        # C (I + c P C/2)^-1: the two are symmetric matrices, and so is the result.
-        a11, a12 = 1.0 + half * (2.0 * c11 - c12) / 3.0, half * (2.0 * c12 - c22) / 3.0
-        a21, a22 = half * (2.0 * c12 - c11) / 3.0, 1.0 + half * (2.0 * c22 - c12) / 3.0
-        over = self.ratio / (a11 * a22 - a12 * a21)
-        t1 += (self.ratio * s1).sum(axis=0)
-        t2 += (self.ratio * s2).sum(axis=0)
-        h11 += ((c11 * a22 - c12 * a21) * over).sum(axis=0)
-        h12 += ((c12 * a11 - c11 * a12) * over).sum(axis=0)
-        h22 += ((c22 * a11 - c12 * a12) * over).sum(axis=0)
-        return t1, t2, h11, h12, h22
-
-
-class _NoState(Exception):
-    """The film has no stable state here."""
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One step of time.
-
-    dt : its length (s)
-    viscous, rate, state, lam : viscous strains and their rates, state and dimensionless force at its end
-    defect, drift : estimated errors of the dimensionless force, and of the viscous strains on average
-    tail : error of the dimensionless force by the number of modes
-    """
-
-    dt: float
-    viscous: Array
-    rate: Array
-    state: State
-    lam: float
-    defect: float
-    drift: float
-    tail: float
-
-
-class Stepper:
-    """A film on its way through a history."""
-
-    def __init__(self, specimen: Specimen, t: Array, h: Array, voltage: Array, tolerance: float) -> None:
-        self.specimen, self.t, self.h, self.voltage = specimen, t, h, voltage
-        material = specimen.material
-        shear = material.shear_modulus
-        branches = [one for one in material.branches if one.ratio > 0.0]
-        self.ratio = np.array([one.ratio for one in branches]).reshape(-1, 1, 1, 1)
-        self.time = np.array([one.time for one in branches]).reshape(-1, 1, 1, 1)
-        self.law = material.law(np.array(material.mu)[:, None] / shear, np.array(material.alpha).reshape(-1, 1))
-        self.field = material.permittivity / (specimen.thickness**2 * shear)
-        self.unit = 2.0 * math.pi * specimen.ring_radius * specimen.thickness * shear / specimen.prestretch**2
-        self.log_prestretch = math.log(specimen.prestretch)
-        self.span = math.log(specimen.ring_radius / specimen.disk_radius)
-        self.goal = max(1e-7, math.sqrt(0.03 * tolerance))
-        self.charged = bool(voltage.any())
-        self.count = Evaluations()
-        breaks = self.problem(np.array([t[0]]), self.law).cut()
-        modes = refinement.first_modes(self.span / (len(breaks) - 1), tolerance) + MORE_MODES
-        self.grid = Grid.lay(modes, breaks)
-        shape = (2, len(branches), *self.grid.radius.shape)
-        self.now = float(t[0])
-        self.viscous = np.full(shape, self.log_prestretch)
-        self.rate = np.zeros(shape)
-        elastic = self.problem(np.array([t[0]]), self.law)
-        elastic.height = np.maximum(elastic.height, 1e-3)
-        self.state = ritz.guess(elastic, self.grid)
-        self.height = elastic.height
-
-    def problem(self, t: Array, law: Law | _Stage) -> Problem:
-        """The membrane at the times ``t``, with ``law`` for its film."""
-        height = np.abs(np.interp(t, self.t, self.h)) / self.specimen.ring_radius
-        field = self.field * np.interp(t, self.t, self.voltage) ** 2 if self.charged else None
-        same = np.ones(len(t))
-        film = Film(law, field, self.count)  # type: ignore[arg-type] # a stage answers like a law
-        return Problem(film, self.log_prestretch * same, self.span * same, np.maximum(height, FLAT))
-
-    def balance(self, t: Array, start: Array, dt: float) -> tuple[refinement.Iterate, _Stage, ritz.Points]:
-        """Equilibrium at the times ``t`` with viscous strains ``start`` that follow for ``dt`` times the diagonal.
-
-        Raises
-        ------
-        _NoState : none that is stable was found
-        """
-        stage = _Stage(self.law, start, self.ratio, DIAGONAL * dt / self.time)
-        problem = self.problem(t, stage)
-        state, grid = self.state, self.grid
-        if len(t) > 1:
-            first = np.zeros(len(t), dtype=np.intp)
-            state, grid = state.take(first), grid.take(first)
-        begun = State(state.c, state.w * (problem.height / self.height))
-        found = refinement.newton(problem, grid, begun, self.goal)
-        at = ritz.evaluate(problem, grid, found.state)
-        if not (found.ok.all() and np.isfinite(at.law.t1).all()):
-            raise _NoState
-        return found, stage, at
-
-    def begin(self) -> None:
-        """The state at the beginning: branches rested in the flat film."""
-        if self.h[0] == 0.0:
-            return
-        found, _, at = self.balance(np.array([self.now]), self.viscous, 0.0)
-        self.state, self.height = found.state, self.problem(np.array([self.now]), self.law).height
-        self.rate = self.flow(at.log[:2, None] - self.viscous)
-
-    def flow(self, elastic: Array) -> Array:
-        """``dv/dt`` of branches with these elastic strains."""
-        s1, s2, *_ = self.law.derivatives(stack(elastic[0], elastic[1]))
-        return np.array((2.0 * s1 - s2, 2.0 * s2 - s1)) / (6.0 * self.time)
-
-    def step(self, dt: float) -> Step:
-        """A step from now, which `accept` takes. Raises `_NoState`."""
-        kept, height = self.state, self.height
-        rates: list[Array] = []
-        try:
-            for node, row in zip(NODES, MATRIX, strict=True):
-                start = self.viscous + dt * sum((a * rate for a, rate in zip(row, rates, strict=True)), np.zeros(1))
-                here = np.array([self.now + node * dt])
-                found, stage, at = self.balance(here, start, dt)
-                w, _ = stage.branch(at.log)
-                rates.append((at.log[:2, None] - w - start) / (DIAGONAL * dt))
-                self.state, self.height = found.state, self.problem(here, self.law).height
-            viscous = start + DIAGONAL * dt * rates[-1]
-            defect = dt * sum((e * rate for e, rate in zip(DEFECT, rates, strict=True)), np.zeros(1))
-            other, _, _ = self.balance(here, viscous - defect, 0.0)
-        except _NoState:
-            self.state, self.height = kept, height
-            raise
-        self.state, self.height = kept, height
-        lam = float(found.lam[0])
-        drift = (self.ratio / (1.0 + self.ratio.sum()) * np.abs(defect)).sum(axis=1)
-        # Of a flat film the force is zero whatever the number of modes.
-        tail = abs(float(found.tail[0]) * lam) if float(self.problem(here, self.law).height[0]) > FLAT else 0.0
-        return Step(dt, viscous, rates[-1], found.state, lam, abs(float(other.lam[0]) - lam), float(drift.mean()), tail)
-
-    def accept(self, step: Step) -> None:
-        """Go on to the end of a step."""
-        self.now += step.dt
-        self.viscous, self.rate, self.state = step.viscous, step.rate, step.state
-        self.height = self.problem(np.array([self.now]), self.law).height
-
-    def lost(self, step: Step | None) -> Status:
-        """Why there is no state after now: the film hangs slack, is unstable under its voltage, or neither is sure."""
-        at = ritz.evaluate(self.problem(np.array([self.now]), self.law), self.grid, self.state)
-        if step is not None:
-            return Status.NOT_CONVERGED
-        if float(at.law.t1.min()) < 0.05 * float(at.law.t1.max()):
-            return Status.SLACK
-        return Status.UNSTABLE if float(np.interp(self.now, self.t, self.voltage)) != 0.0 else Status.NOT_CONVERGED
-
-    def within(self, step: Step, times: Array) -> Array:
-        """Viscous strains at times inside a step, by the cubic through its ends and their rates: (2, K, Q, M, times).
-
-        Its error is of the order of the step's own estimate.
-        """
-        x = (times - self.now) / step.dt
-        rise = step.viscous - self.viscous
-        found: Array = self.viscous + x * x * (3.0 - 2.0 * x) * rise
-        found += step.dt * x * (1.0 - x) * ((1.0 - x) * self.rate - x * step.rate)
-        return found
+    dforce: dict[str, Array] | None = None
 
 
 def solve_history(
@@ -295,6 +77,7 @@ def solve_history(
     times: ArrayLike | None = None,
     *,
     tolerance: float = 1e-6,
+    sensitivities: bool = False,
 ) -> History:
     """Force along a history, from a film rested flat in its pre-stretched state at ``t[0]``.
 
@@ -305,6 +88,7 @@ def solve_history(
     h, voltage : displacement of the disk (m) and voltage (V) there, linear in between
     times : where the answer is wanted, within ``t``; at ``t`` itself when not given
     tolerance : error of the force to aim for, over the largest force of the history: 1e-10 to 1e-2
+    sensitivities : also give ``dforce``, for about twice the cost; their error is some tolerances, relative
 
     Returns
     -------
@@ -314,26 +98,65 @@ def solve_history(
     ------
     ValueError : the history is no history, or times lie outside it
     """
-    t, h, voltage, times = _checked(t, h, voltage, times, tolerance)
-    found = _Answers(len(times))
+    return solve_histories([specimen], [(t, h, voltage, times)], tolerance=tolerance, sensitivities=sensitivities)[0]
+
+
+def solve_histories(
+    specimens: Sequence[Specimen],
+    histories: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike | None]],
+    *,
+    tolerance: float = 1e-6,
+    sensitivities: bool = False,
+) -> list[History]:
+    """`solve_history` of many films at once: each takes its own steps, for a fraction of the cost apart.
+
+    Parameters
+    ----------
+    specimens : the films, one a history
+    histories : ``(t, h, voltage, times)`` of each, as in `solve_history`
+    tolerance, sensitivities : as in `solve_history`
+
+    Returns
+    -------
+    A `History` each. Company changes the forces by less than the tolerance.
+
+    Raises
+    ------
+    ValueError : a history is none
+    """
+    if len(specimens) != len(histories):
+        raise ValueError(f"{len(specimens)} specimens and {len(histories)} histories; give one history a specimen")
+    checked = [_checked(*one, tolerance) for one in histories]
+    if not sensitivities:
+        specimens = [_bare(one) for one in specimens]
+    columns = [_columns(one) if sensitivities else 0 for one in specimens]
+    answers = [_Answer.empty(len(one[1]), count) for one, count in zip(checked, columns, strict=True)]
+    lost: dict[int, tuple[float, Status]] = {}
     with np.errstate(all="ignore"):
-        elastic = solve_many(specimen, h, voltage, tolerance=1e-4).force
-        scale = float(np.nanmax(np.abs(elastic), initial=0.0))
-        stepper = Stepper(specimen, t, h, voltage, tolerance)
-        scale = scale / stepper.unit or 1e-12
-        try:
-            stepper.begin()
-        except _NoState:
-            found.end(np.arange(len(times)), Status.NOT_CONVERGED)
-            return found.history(1.0, 0, 0)
-        found.read(stepper, np.flatnonzero(times == t[0]), times, stepper.viscous, 0.0)
-        steps, rejected = _march(stepper, times, found, scale, STEP_SHARE * tolerance)
-    return found.history(scale * stepper.unit, steps, rejected)
+        largest = _elastic(specimens, [course for course, _ in checked])
+        for modes, mine in _alike(specimens, tolerance):
+            films = Films.of([specimens[k] for k in mine], modes)
+            courses, times = [checked[k][0] for k in mine], [checked[k][1] for k in mine]
+            scale = np.where(largest[mine] > 0.0, largest[mine] / films.unit, 1e-12)
+            trail = march(films, courses, scale, tolerance, sensitivities)
+            some = [answers[k] for k in mine]
+            for place, k in enumerate(mine):
+                answers[k].scale = float(scale[place] * films.unit[place])
+                answers[k].steps = int(trail.taken[place]), int(trail.rejected[place])
+            lost |= {mine[place]: how for place, how in trail.lost.items()}
+            _Reader(films, courses, trail, times, some, goal(tolerance, sensitivities), tolerance * scale).read()
+    return [answers[k].history(specimen, *checked[k], lost.get(k)) for k, specimen in enumerate(specimens)]
+
+
+def _columns(specimen: Specimen) -> int:
+    """`Films.columns` of a film."""
+    material = specimen.material
+    return len(material.mu) + len(material.alpha) + 2 * len(material.branches) + 3
 
 
 def _checked(
     t: ArrayLike, h: ArrayLike, voltage: ArrayLike, times: ArrayLike | None, tolerance: float
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Course, Array]:
     t = np.atleast_1d(np.asarray(t, dtype=float))
     if t.ndim != 1 or len(t) < 2:
         raise ValueError("t: a history needs at least two times")
@@ -352,125 +175,270 @@ def _checked(
         raise ValueError(f"times must be finite and within the history, {t[0]:g} to {t[-1]:g} s")
     if not 1e-10 <= tolerance <= 1e-2:
         raise ValueError(f"tolerance = {tolerance!r}: allowed are 1e-10 to 1e-2")
-    return t, values[0], values[1], asked
+    return Course(t, *values), asked
 
 
-def _march(stepper: Stepper, times: Array, found: _Answers, scale: float, allowed: float) -> tuple[int, int]:
-    """Step through the history and read the answers on the way; steps taken and rejected."""
-    steps = rejected = 0
-    error = 0.0
-    for left, right in zip(stepper.t[:-1].tolist(), stepper.t[1:].tolist(), strict=True):
-        dt = FIRST_SHARE * (right - left)
-        shortest = LEAST_STEP * min([right - left, *stepper.time.ravel().tolist()])
-        failures = 0
-        while stepper.now < right:
-            rest = right - stepper.now
-            dt = rest if dt > 0.99 * rest else min(dt, max(0.5 * rest, 1e-3 * dt))
-            step: Step | None = None
-            try:
-                step = stepper.step(dt)
-                size = max(step.defect / scale, step.drift) / allowed
-            except _NoState:
-                size = math.inf
-            factor = SAFETY * size**-0.25 if 0.0 < size < math.inf else (MOST_FACTOR if size == 0.0 else 0.25)
-            factor = min(max(factor, LEAST_FACTOR), MOST_FACTOR)
-            if step is None or not size <= 1.0:
-                rejected += 1
-                failures += 1
-                dt *= min(factor, 0.7)
-                if failures > MOST_REJECTED or dt < shortest:
-                    later = np.flatnonzero(times > stepper.now)
-                    found.end(later, stepper.lost(step))
-                    return steps, rejected
-                continue
-            failures = 0
-            steps += 1
-            error += EMBEDDED_FACTOR * max(step.defect / scale, step.drift)
-            end = right if dt == rest else stepper.now + dt
-            inside = np.flatnonzero((times > stepper.now) & (times <= end))
-            if len(inside):
-                viscous = stepper.within(step, times[inside])
-                kept = stepper.state, stepper.height
-                stepper.state = step.state
-                stepper.height = stepper.problem(np.array([end]), stepper.law).height
-                found.read(stepper, inside, times, viscous, error + step.tail / scale)
-                stepper.state, stepper.height = kept
-            stepper.accept(step)
-            stepper.now = end
-            dt *= factor
-    return steps, rejected
+def _bare(specimen: Specimen) -> Specimen:
+    """The film without branches that are none."""
+    branches: tuple[Branch, ...] = tuple(one for one in specimen.material.branches if one.ratio > 0.0)
+    if len(branches) == len(specimen.material.branches):
+        return specimen
+    return specimen.with_material(replace(specimen.material, branches=branches))
 
 
-class _Answers:
-    """The answers while they are being filled, one entry a time."""
+def _elastic(specimens: Sequence[Specimen], courses: Sequence[Course]) -> Array:
+    """Largest force (N) of each relaxed film where its course bends."""
+    films = np.empty(sum(len(one.t) for one in courses), dtype=np.object_)
+    films[:] = [specimen for specimen, one in zip(specimens, courses, strict=True) for _ in one.t]
+    h, voltage = (np.concatenate([getattr(one, name) for one in courses]) for name in ("h", "voltage"))
+    force = np.abs(solve_many(films, h, voltage, tolerance=1e-4).force)
+    ends = np.cumsum([len(one.t) for one in courses])[:-1]
+    return np.array([float(np.nanmax(one, initial=0.0)) for one in np.split(force, ends)])
 
-    def __init__(self, count: int) -> None:
-        names = ("force", "peak_field", "min_hoop_stress", "min_meridional_stress", "error")
-        self.real = {name: np.full(count, np.nan) for name in names}
-        self.status = np.full(count, Status.NOT_CONVERGED, dtype=np.int8)
 
-    def end(self, index: NDArray[np.intp], status: Status) -> None:
-        """No state any more at these times."""
-        self.status[index] = status
+def _alike(specimens: Sequence[Specimen], tolerance: float) -> list[tuple[int, list[int]]]:
+    """Films that can be solved together: the modes that they take, and their numbers."""
+    found: dict[tuple[object, ...], list[int]] = {}
+    for k, one in enumerate(specimens):
+        material = one.material
+        span = np.log(one.ring_radius / one.disk_radius)
+        pieces = ritz.elements(np.array([span]))
+        modes = refinement.first_modes(span / pieces, tolerance) + MORE_MODES
+        kind = (material.law, len(material.mu), len(material.alpha), len(material.branches), pieces, modes)
+        found.setdefault(kind, []).append(k)
+    return [(kind[-1], mine) for kind, mine in found.items()]  # type: ignore[misc]
 
-    def read(self, stepper: Stepper, index: NDArray[np.intp], times: Array, viscous: Array, error: float) -> None:
-        """The film at ``times[index]``, with its viscous strains there (2, K, Q, M, times)."""
-        if len(index) == 0:
-            return
-        here = times[index]
-        film = stepper.specimen
-        shear = film.material.shear_modulus
-        h, volts = np.interp(here, stepper.t, stepper.h), np.interp(here, stepper.t, stepper.voltage)
-        viscous = np.broadcast_to(viscous, (*viscous.shape[:-1], len(here)))
-        if (h == 0.0).all() and bool((viscous == stepper.log_prestretch).all()):
-            self._flat(stepper, index, volts)
-            return
-        try:
-            found, _, at = stepper.balance(here, viscous, 0.0)
-        except _NoState:
-            if len(index) > 1:  # one by one: some may have a state
-                for k in range(len(index)):
-                    self.read(stepper, index[k : k + 1], times, viscous[..., k : k + 1], error)
-            return
-        fine = fine_table(stepper.grid.table.modes)
+
+@dataclass(slots=True)
+class _Answer:
+    """The answers of one history while they are being filled.
+
+    rows : dimensionless force, largest field over that of the flat film's unit, least hoop and meridional stress, and
+        the derivatives of the force, (4 + P, times)
+    """
+
+    rows: Array
+    error: Array
+    status: NDArray[np.int8]
+    scale: float = 1.0
+    steps: tuple[int, int] = (0, 0)
+
+    @classmethod
+    def empty(cls, count: int, columns: int) -> _Answer:
+        status = np.full(count, Status.NOT_CONVERGED, dtype=np.int8)
+        return cls(np.full((4 + columns, count), np.nan), np.full(count, np.nan), status)
+
+    def fill(self, asked: NDArray[np.intp], rows: Array, error: Array | float) -> None:
+        """Take over solved answers."""
+        self.rows[:, asked] = rows
+        self.error[asked] = error
+        wrinkled = rows[HOOP] < ROUND_OFF_TENSION * rows[MERIDIONAL]
+        status = np.where(wrinkled, Status.WRINKLED, Status.TAUT)
+        self.status[asked] = np.where(np.isfinite(rows[0]), status, Status.NOT_CONVERGED)
+
+    def history(self, specimen: Specimen, course: Course, times: Array, lost: tuple[float, Status] | None) -> History:
+        """Everything with its units, the error over the largest force of the history."""
+        if lost is not None:
+            self.status[times > lost[0]] = lost[1]
+        film, material = specimen, specimen.material
+        answered = self.status <= Status.WRINKLED
+        shear = material.shear_modulus
+        unit = 2.0 * np.pi * film.ring_radius * film.thickness * shear / film.prestretch**2
+        h, volts = np.interp(times, course.t, course.h), np.interp(times, course.t, course.voltage)
+        rows = np.where(answered, self.rows, np.nan)
+        side = np.where(h < 0.0, -1.0, 1.0)
+        force = np.where(answered & (h == 0.0), 0.0, side * unit * rows[0])
+        largest = max(float(np.nanmax(np.abs(force), initial=0.0)), self.scale)
+        slopes = None
+        if len(rows) > 4:
+            slopes = _with_units(specimen, force, unit, side * unit * rows[4:], side)
+        return History(
+            force=force,
+            peak_field=np.abs(volts) / film.thickness * np.exp(rows[PEAK]),
+            min_hoop_stress=shear * rows[HOOP],
+            min_meridional_stress=shear * rows[MERIDIONAL],
+            status=self.status,
+            error_estimate=np.where(answered, self.error * self.scale / largest, np.nan),
+            steps=self.steps[0],
+            rejected=self.steps[1],
+            dforce=slopes,
+        )
+
+
+def _with_units(specimen: Specimen, force: Array, unit: float, rows: Array, side: Array) -> dict[str, Array]:
+    """Derivatives (N over the parameter's unit) from those of the columns in `Films.columns`, in N."""
+    material, n, k = specimen.material, len(specimen.material.mu), len(specimen.material.branches)
+    shapes = len(material.alpha)
+    mu, alpha, field, ratio, time, prestretch, height = np.split(rows, np.cumsum([n, shapes, 1, k, k, 1]))
+    return {
+        "mu": mu.T / material.shear_modulus,
+        "alpha": alpha.T,
+        "eps_r": field[0] / material.eps_r,
+        "ratio": ratio.T,
+        "time": time.T / np.array([one.time for one in material.branches]),
+        "thickness": (force - 2.0 * field[0]) / specimen.thickness,
+        "prestretch": (prestretch[0] - 2.0 * force) / specimen.prestretch,
+        "h": height[0],
+    }
+
+
+@dataclass(slots=True)
+class _Job:
+    """States to solve within one step of a film: shares ``x`` of the step, for the answers ``asked``."""
+
+    film: int
+    step: Step
+    column: int
+    x: Array
+    asked: NDArray[np.intp]
+    x_asked: Array
+
+
+class _Reader:
+    """Reads the answers from the steps of a march."""
+
+    def __init__(
+        self,
+        films: Films,
+        courses: Sequence[Course],
+        trail: Trail,
+        times: Sequence[Array],
+        answers: Sequence[_Answer],
+        goal: float,
+        allowed: Array,
+    ) -> None:
+        self.films, self.courses, self.trail, self.times = films, courses, trail, times
+        self.answers, self.goal, self.allowed = answers, goal, allowed
+
+    def read(self) -> None:
+        """Fill every answer."""
+        nodes = FEW
+        jobs = self._jobs()
+        while jobs:
+            again = []
+            for job, rows, ok in self._solved(jobs):
+                answer, error = self.answers[job.film], float(job.step.error[job.column])
+                if job.x is job.x_asked:
+                    answer.fill(job.asked, np.where(ok, rows, np.nan), error)
+                elif not ok.all():
+                    again.append(replace(job, x=job.x_asked))
+                else:
+                    found, missed = _between(rows, job.x_asked)
+                    if missed > self.allowed[job.film] and nodes < MOST_NODES:
+                        again.append(replace(job, x=_lobatto(2 * nodes - 1)))
+                    else:
+                        answer.fill(job.asked, found, error + missed / self.scale(job.film))
+            jobs, nodes = again, 2 * nodes - 1
+
+    def scale(self, film: int) -> float:
+        """Largest dimensionless force of a film."""
+        return float(self.answers[film].scale / self.films.unit[film])
+
+    def _jobs(self) -> list[_Job]:
+        """Every step that has answers in it."""
+        taken: list[list[tuple[Step, int]]] = [[] for _ in self.answers]
+        for step in self.trail.steps:
+            for column in np.flatnonzero(step.ok).tolist():
+                taken[int(step.which[column])].append((step, column))
+        jobs = []
+        for film, (mine, times) in enumerate(zip(taken, self.times, strict=True)):
+            start = self.courses[film].t[0]
+            at_start = np.flatnonzero(times == start)
+            if len(at_start) and self.trail.lost.get(film, (start, 0))[0] >= start:
+                x = np.zeros(len(at_start))
+                jobs.append(_Job(film, self.trail.begin, film, x, at_start, x))
+            ends = np.array([float(step.begin[c] + step.dt[c]) for step, c in mine])
+            if len(ends) and film not in self.trail.lost:
+                ends[-1] = self.courses[film].t[-1]
+            place = np.searchsorted(ends, times)
+            place[times == start] = len(ends)
+            order = np.argsort(place, kind="stable")
+            bounds = np.searchsorted(place[order], np.arange(len(ends) + 1))
+            for k, (step, column) in enumerate(mine):
+                asked = order[bounds[k] : bounds[k + 1]]
+                if len(asked):
+                    x = (times[asked] - step.begin[column]) / step.dt[column]
+                    jobs.append(_Job(film, step, column, x if len(x) <= FEW else _lobatto(FEW), asked, x))
+        return jobs
+
+    def _solved(self, jobs: Sequence[_Job]) -> Iterator[tuple[_Job, Array, NDArray[np.bool_]]]:
+        """Rows of an answer (4 + P, nodes) of every job, and where there is one."""
+        some: list[_Job] = []
+        size = 0
+        for k, job in enumerate(jobs):
+            some.append(job)
+            size += len(job.x)
+            if size >= CHUNK or k + 1 == len(jobs):
+                rows, ok = self._states(some)
+                cuts = np.cumsum([len(one.x) for one in some])[:-1]
+                yield from zip(some, np.split(rows, cuts, axis=1), np.split(ok, cuts), strict=True)
+                some, size = [], 0
+
+    def _states(self, jobs: Sequence[_Job]) -> tuple[Array, NDArray[np.bool_]]:
+        count = [len(job.x) for job in jobs]
+        films = self.films.take(np.repeat([job.film for job in jobs], count))
+        x = np.concatenate([job.x for job in jobs])
+
+        def gather(name: str, end: str) -> Array:
+            values = [getattr(getattr(job.step, end), name)[..., job.column] for job in jobs]
+            found: Array = np.repeat(np.stack(values, axis=-1), count, axis=-1)
+            return found
+
+        dt = np.repeat([job.step.dt[job.column] for job in jobs], count)
+        t = np.repeat([job.step.begin[job.column] for job in jobs], count) + x * dt
+        owner = np.repeat(np.arange(len(jobs)), count)
+        h, voltage = np.empty((2, len(x)))
+        for k, job in enumerate(jobs):
+            course = self.courses[job.film]
+            h[owner == k] = np.interp(t[owner == k], course.t, course.h)
+            voltage[owner == k] = np.interp(t[owner == k], course.t, course.voltage)
+        instant = Instant(h, voltage)
+        viscous = _hermite(x, dt, *(gather(name, end) for end in ("before", "after") for name in ("viscous", "rate")))
+        p0, p1 = gather("packed", "before"), gather("packed", "after")
+        middle = np.repeat(np.stack([job.step.middle[..., job.column] for job in jobs], axis=-1), count, axis=-1)
+        packed = p0 + x * (p1 - p0 + 2.0 * (1.0 - x) * (2.0 * middle - p0 - p1))
+        state = unpack(films, instant.height(films), packed)
+        state.w = np.where(state.w > 0.0, state.w, unpack(films, instant.height(films), p1).w)
+        at = balance(films, instant, viscous, np.zeros_like(films.time), state, self.goal)
+        fine = fine_table(films.grid.table.modes)
 
         def largest(values: Array) -> Array:
-            inside = np.tensordot(fine, values, 1)
-            most: Array = inside.max(axis=(0, 1))
+            most: Array = np.tensordot(fine, values, 1).max(axis=(0, 1))
             return most
 
-        hoop, meridional = -largest(-at.law.t2), -largest(-at.law.t1)
-        self.real["force"][index] = np.sign(h) * stepper.unit * found.lam
-        self.real["peak_field"][index] = np.abs(volts) / film.thickness * np.exp(largest(-at.log[2]))
-        self.real["min_hoop_stress"][index] = shear * hoop
-        self.real["min_meridional_stress"][index] = shear * meridional
-        self.real["error"][index] = error
-        self.status[index] = np.where(hoop < ROUND_OFF_TENSION * meridional, Status.WRINKLED, Status.TAUT)
+        law = at.points.law
+        rows = [at.lam, largest(-at.points.log[2]), -largest(-law.t2), -largest(-law.t1)]
+        if jobs[0].step.before.viscous_slopes is not None:
+            names = ("viscous_slopes", "rate_slopes")
+            start = _hermite(x, dt, *(gather(name, end) for end in ("before", "after") for name in names))
+            rows += list(slopes(at, instant, start).lam)
+        return np.array(rows), at.ok
 
-    def _flat(self, stepper: Stepper, index: NDArray[np.intp], volts: Array) -> None:
-        """The flat film at rest: the same stress in all directions, and no force."""
-        film, log = stepper.specimen, np.full(1, stepper.log_prestretch)
-        area = 2.0 * stepper.log_prestretch
-        stress = stepper.law.derivatives(stack(log, log))[0] - stepper.field * volts**2 * math.exp(2.0 * area)
-        for name in ("min_hoop_stress", "min_meridional_stress"):
-            self.real[name][index] = film.material.shear_modulus * stress
-        self.real["force"][index] = self.real["error"][index] = 0.0
-        self.real["peak_field"][index] = np.abs(volts) / film.thickness * math.exp(area)
-        self.status[index] = np.where(stress < 0.0, Status.SLACK, Status.TAUT)
-        self.real["force"][index[self.status[index] == Status.SLACK]] = np.nan
 
-    def history(self, scale: float, steps: int, rejected: int) -> History:
-        """Everything, the error over the largest force of the history; ``scale`` (N) is that of the relaxed film."""
-        force = self.real["force"]
-        answered = self.status <= Status.WRINKLED
-        largest = max(float(np.abs(force[answered]).max(initial=0.0)), scale)
-        return History(
-            force=np.where(answered, force, np.nan),
-            peak_field=self.real["peak_field"],
-            min_hoop_stress=self.real["min_hoop_stress"],
-            min_meridional_stress=self.real["min_meridional_stress"],
-            status=self.status,
-            error_estimate=np.where(answered, self.real["error"] * scale / largest, np.nan),
-            steps=steps,
-            rejected=rejected,
-        )
+def _hermite(x: Array, dt: Array, first: Array, first_rate: Array, last: Array, last_rate: Array) -> Array:
+    """The cubic through both ends of a step and their rates, at the shares ``x`` of it.
+
+    Its error is of the order of the step's own estimate.
+    """
+    found = first + x * x * (3.0 - 2.0 * x) * (last - first)
+    found += dt * x * (1.0 - x) * ((1.0 - x) * first_rate - x * last_rate)
+    return found
+
+
+@lru_cache(maxsize=16)
+def _lobatto(count: int) -> Array:
+    """Chebyshev's points on [0, 1], ends included."""
+    nodes: Array = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))
+    return nodes
+
+
+def _between(rows: Array, x: Array) -> tuple[Array, float]:
+    """Polynomials through the values (rows, nodes) at Chebyshev's points, at ``x``; and the error of the first."""
+    count = rows.shape[1]
+    angle = np.pi * np.arange(count) / (count - 1)
+    basis = np.cos(np.outer(np.arange(count), np.pi - angle))
+    basis[:, [0, -1]] *= 0.5
+    c = (2.0 / (count - 1)) * rows @ basis.T
+    c[:, [0, -1]] *= 0.5
+    found: Array = c @ np.cos(np.outer(np.arange(count), np.arccos(np.clip(2.0 * x - 1.0, -1.0, 1.0))))
+    return found, float(max(abs(c[0, -1]), 0.1 * abs(c[0, -2])))

@@ -17,10 +17,12 @@ import pytest
 
 from model.arrays import Array
 from model.material.gent import Gent
-from model.material.law import Law, stack
 from model.material.materials import NAMED, Branch, Material
-from model.membrane.history import Stepper, _Stage, solve_history
+from model.material.yeoh import Yeoh
+from model.membrane.history import History, solve_histories, solve_history
+from model.membrane.march import Course, March
 from model.membrane.solve import Status, solve, solve_many
+from model.membrane.viscous import Films, Instant, State, balance
 from model.specimen import Specimen
 
 PARKER = NAMED["parker-cao2018"]
@@ -144,13 +146,13 @@ def test_error_falls_with_the_fourth_power_of_the_step() -> None:
     t, h, voltage = np.array([0.0, 8.0]), np.array([2e-3, 10e-3]), np.array([300.0, 800.0])
     exact = solve_history(specimen, t, h, voltage, [8.0], tolerance=1e-9).force[0]
     errors = []
+    films = Films.of([specimen], 9)
     for count in (4, 8, 16):
-        stepper = Stepper(specimen, t, h, voltage, 1e-9)
-        stepper.begin()
+        march = March(films, [Course(t, h, voltage)], 1e-9)
         for _ in range(count):
-            step = stepper.step(8.0 / count)
-            stepper.accept(step)
-        errors.append(abs(step.lam * stepper.unit / exact - 1.0))
+            step = march.step(np.array([8.0 / count]))
+            march.accept(step, step.ok, step.begin + step.dt)
+        errors.append(abs(float(step.lam[0] * films.unit[0]) / exact - 1.0))
     ratios = [before / after for before, after in pairwise(errors)]
     assert min(ratios) > 11.0, errors  # 2^3.5
     assert errors[-1] > 1e-10  # the exact value is far better than what it judges
@@ -176,6 +178,7 @@ def test_without_branches_it_is_the_elastic_film() -> None:
     found = solve_history(film([]), t, h, voltage, times)
     elastic = solve_many(film([]), np.interp(times, t, h), np.interp(times, t, voltage))
     np.testing.assert_allclose(found.force, elastic.force, rtol=1e-6)
+    assert found.steps < 30
 
 
 def test_gent_films_take_time_too() -> None:
@@ -197,28 +200,161 @@ def test_dissipation_is_never_negative_and_no_work_is_won_in_a_cycle() -> None:
     assert all(one > 0.0 for one in work)
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.3, 30.0])
-def test_stage_is_the_gradient_of_an_energy(lag: float) -> None:
-    """Its tangents are derivatives of its stresses, and symmetric; c = 0 is the elastic branch, c = inf none."""
-    law: Law = PARKER.law(np.array(PARKER.mu)[:, None] / 1e5, np.array(PARKER.alpha)[:, None])
-    random = np.random.default_rng(2)
-    start = random.uniform(-0.1, 0.3, (2, 2, 3, 1, 4))
-    ratio, c = np.array([0.5, 2.0]).reshape(-1, 1, 1, 1), np.array([lag, 2 * lag]).reshape(-1, 1, 1, 1)
-    log1, log2 = random.uniform(0.0, 0.5, (2, 3, 1, 4))
+@pytest.mark.parametrize("lag", [0.0, 0.3, 30.0, 1e9])
+def test_stage_is_solved_at_every_point(lag: float) -> None:
+    """``x + c P S(x)/2 = u - v*``; c = 0 is the branch at once, c = inf none."""
+    films = Films.of([film([(0.2, 1.0), (0.1, 10.0)])], 8)
+    shape = (2, 2, *films.grid.radius.shape)
+    start = np.full(shape, films.log_prestretch[0])
+    c = np.array([lag, 2.0 * lag]).reshape(-1, 1, 1, 1)
+    height = 10e-3 / 20e-3
+    w = height * films.grid.radius**-0.5
+    first = State(np.zeros((films.grid.unknowns, 1)), w * height / (films.grid.once * w).sum(), np.zeros(shape))
+    with np.errstate(all="ignore"):
+        at = balance(films, Instant(np.array([10e-3]), np.zeros(1)), start, c, first, 1e-7)
+    x = at.state.x
+    s1, s2, *_ = films.law.derivatives(np.concatenate((x, -x[:1] - x[1:])))
+    missed = x + c / 6.0 * np.array((2.0 * s1 - s2, 2.0 * s2 - s1)) - (at.u[:, None] - start)
+    assert at.ok.all() and np.abs(missed).max() < 1e-12 * max(1.0, lag)
+    if lag == 0.0:
+        assert at.lam[0] * films.unit[0] == pytest.approx(0.235222585, rel=1e-8)
+    if lag == 1e9:
+        assert at.lam[0] * films.unit[0] == pytest.approx(solve(film([]), 10e-3).force, rel=1e-6)
 
-    def at(d1: float, d2: float) -> list[Array]:
-        return list(_Stage(law, start, ratio, c).derivatives(stack(log1 + d1, log2 + d2)))
 
-    d = 1e-6
-    _, _, h11, h12, h22 = at(0.0, 0.0)
-    up1, down1, up2, down2 = at(d, 0.0), at(-d, 0.0), at(0.0, d), at(0.0, -d)
-    for got, up, down in (
-        (h11, up1[0], down1[0]),
-        (h12, up1[1], down1[1]),
-        (h12, up2[0], down2[0]),
-        (h22, up2[1], down2[1]),
-    ):
-        np.testing.assert_allclose(got, (up - down) / (2 * d), rtol=1e-6, atol=1e-6)
+def changed(specimen: Specimen, name: str, which: int, factor: float) -> Specimen:
+    """The specimen with one parameter times ``factor``."""
+    m = specimen.material
+
+    def of(values: Sequence[float]) -> tuple[float, ...]:
+        return tuple(value * (factor if k == which else 1.0) for k, value in enumerate(values))
+
+    if name in ("ratio", "time"):
+        values = of([getattr(one, name) for one in m.branches])
+        branches = tuple(replace(one, **{name: value}) for one, value in zip(m.branches, values, strict=True))
+        return specimen.with_material(replace(m, branches=branches))
+    if name in ("mu", "alpha"):
+        return specimen.with_material(replace(m, **{name: of(getattr(m, name))}))
+    if name == "eps_r":
+        return specimen.with_material(replace(m, eps_r=m.eps_r * factor))
+    return replace(specimen, **{name: getattr(specimen, name) * factor})
+
+
+def worst_slope(specimen: Specimen, course: Sequence[object], times: Array, step: float, tolerance: float) -> Array:
+    """Largest differences of ``dforce`` to central differences of the fourth order, over the largest of each."""
+    t, h, voltage = course
+    found = solve_history(specimen, t, h, voltage, times, tolerance=tolerance, sensitivities=True)  # type: ignore[arg-type]
+    assert found.dforce is not None
+    m = specimen.material
+    many = {"mu": len(m.mu), "alpha": len(m.alpha), "ratio": len(m.branches), "time": len(m.branches)}
+    kinds = [(name, k) for name in found.dforce if name != "h" for k in range(many.get(name, 1))]
+    shifts = (1.0, -1.0, 2.0, -2.0)
+    films = [changed(specimen, *kind, 1.0 + step * shift) for kind in kinds for shift in shifts]
+    histories = [(t, h, voltage, times)] * len(films)
+    push = 1e-3 * step
+    histories += [(t, np.asarray(h) + push * shift, voltage, times) for shift in shifts]
+    forces = solve_histories([*films, *[specimen] * 4], histories, tolerance=tolerance)  # type: ignore[arg-type]
+    worst = []
+    for k, kind in enumerate([*kinds, ("h", 0)]):
+        up, down, more, less = (one.force for one in forces[4 * k : 4 * k + 4])
+        value = push if kind[0] == "h" else step * original(specimen, *kind)
+        wanted = (8.0 * (up - down) - (more - less)) / (12.0 * value)
+        got = found.dforce[kind[0]]
+        got = got[:, kind[1]] if kind[0] in many else got
+        worst.append(float(np.abs(got - wanted).max() / np.abs(wanted).max()))
+    return np.array(worst)
+
+
+def original(specimen: Specimen, name: str, which: int) -> float:
+    """The value of one parameter."""
+    m = specimen.material
+    values = {"mu": m.mu, "alpha": m.alpha, "eps_r": (m.eps_r,)}
+    values |= {"ratio": tuple(b.ratio for b in m.branches), "time": tuple(b.time for b in m.branches)}
+    values |= {"thickness": (specimen.thickness,), "prestretch": (specimen.prestretch,)}
+    return values[name][which]
+
+
+PUSHED = ([0, 2, 4, 4.5, 7], [0, 9e-3, 9e-3, 7e-3, 7e-3], [0, 0, 0, 1200, 1200])
+
+
+@pytest.mark.slow
+def test_derivatives_agree_with_differences() -> None:
+    times = np.array([1.5, 3.0, 4.2, 7.0])
+    worst = worst_slope(film([(0.3, 1.0), (0.4, 6.0)], 5e-3), PUSHED, times, 0.02, 1e-9)
+    assert (worst < 1e-6).all(), worst
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["gent", "yeoh", "pulled"])
+def test_derivatives_of_other_laws_and_of_a_film_pulled_from_the_start(law: str) -> None:
+    t, h, voltage = PUSHED
+    specimen = film([(0.5, 2.0)], 6e-3)
+    if law == "gent":
+        specimen = specimen.with_material(replace(specimen.material, mu=(8e4,), alpha=(30.0,), law=Gent))
+    elif law == "yeoh":
+        specimen = specimen.with_material(replace(specimen.material, mu=(5e4, -500.0, 20.0), alpha=(), law=Yeoh))
+    else:
+        h = [-4e-3, *h[1:]]
+    worst = worst_slope(specimen, (t, h, voltage), np.array([1.5, 4.2, 7.0]), 0.02, 1e-8)
+    assert (worst < 1e-5).all(), worst
+
+
+def test_derivatives_scale_as_the_forces_do() -> None:
+    """Moduli and permittivity together scale the force; a branch split in two has two halves of its slopes."""
+    t, h, voltage = PUSHED
+    whole = film([(0.3, 1.0)], 5e-3)
+    halves = whole.with_material(replace(whole.material, branches=(Branch(0.1, 1.0), Branch(0.2, 1.0))))
+    one, two = solve_histories([whole, halves], [(t, h, voltage, [1.5, 4.2, 7.0])] * 2, sensitivities=True)
+    assert one.dforce is not None and two.dforce is not None
+    scaled = one.dforce["mu"] @ np.array(whole.material.mu) + one.dforce["eps_r"] * whole.material.eps_r
+    np.testing.assert_allclose(scaled, one.force, rtol=1e-5)
+    np.testing.assert_allclose(two.dforce["ratio"], one.dforce["ratio"] * [1.0, 1.0], rtol=1e-5)
+    np.testing.assert_allclose(two.dforce["time"], one.dforce["time"] * [1 / 3, 2 / 3], rtol=1e-5)
+    np.testing.assert_allclose(two.force, one.force, rtol=1e-6)
+    np.testing.assert_allclose(two.dforce["h"], one.dforce["h"], rtol=1e-5)
+
+
+def test_a_branch_of_no_stiffness_has_a_slope() -> None:
+    """It adds its share of the force that it would have: with the ratio 0 as with a small one."""
+    t, h, voltage = PUSHED
+    none, small = (film([(0.2, 3.0), (ratio, 1.0)], 5e-3) for ratio in (0.0, 1e-5))
+    one, two = solve_histories([none, small], [(t, h, voltage, [3.0])] * 2, tolerance=1e-5, sensitivities=True)
+    assert one.dforce is not None
+    assert one.dforce["ratio"][0, 1] > 0.01
+    assert one.dforce["time"][0, 1] == 0.0
+    assert (two.force - one.force)[0] / 1e-5 == pytest.approx(one.dforce["ratio"][0, 1], rel=0.1)
+
+
+def test_many_histories_at_once_are_those_alone() -> None:
+    """Each has its own steps and end; of unlike films, and one that has no state in its middle."""
+    soft = film([(0.2, 1.0)], 6e-3, 1.2, Material("soft", (3e4,), (2.0,), 5.0))
+    films = [film([(0.3, 2.0)]), film([(0.1, 1.0), (0.1, 9.0)], 6e-3), soft, film([(0.5, 0.3)], 9e-3)]
+    courses = [
+        ([0, 3, 9], [0, 8e-3, 8e-3], [0, 0, 900], [1.0, 9.0]),
+        ([0, 1], [5e-3, 5e-3], 0.0, [0.0, 0.7]),
+        ([0, 5, 15], [0, 5e-3, 5e-3], [0, 0, 6000.0], [4.0, 15.0]),
+        ([0, 3, 9], [0, -8e-3, 2e-3], 0.0, [1.0, 9.0]),
+    ]
+    together = solve_histories(films, courses, tolerance=1e-4)  # type: ignore[arg-type]
+    for specimen, course, found in zip(films, courses, together, strict=True):
+        alone: History = solve_history(specimen, *course, tolerance=1e-4)  # type: ignore[arg-type]
+        largest = float(np.nanmax(np.abs(alone.force)))
+        np.testing.assert_allclose(found.force, alone.force, atol=1e-5 * largest)
+        assert (found.status == alone.status).all()
+        assert abs(found.steps - alone.steps) <= 3
+
+
+def test_answers_between_solved_states_follow_them() -> None:
+    """A thousand answers in a few steps, of films without and with branches, against those asked for one by one."""
+    t, h, voltage = PUSHED
+    films = [film([], 5e-3), film([(0.3, 1.0)], 5e-3)]
+    many = np.linspace(0.0, 7.0, 1001)
+    dense = solve_histories(films, [(t, h, voltage, many)] * 2, tolerance=1e-5)
+    single = solve_histories(films, [(t, h, voltage, many[7::60])] * 2, tolerance=1e-5)
+    for one, two in zip(dense, single, strict=True):
+        np.testing.assert_allclose(one.force[7::60], two.force, atol=3e-5 * two.force.max())
+        np.testing.assert_allclose(one.peak_field[7::60], two.peak_field, rtol=1e-4, atol=1.0)
+        assert (one.error_estimate < 1e-4).all()
 
 
 @pytest.mark.parametrize(

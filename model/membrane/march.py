@@ -1,0 +1,388 @@
+"""Films with Maxwell branches through time: implicit steps of the fourth order, each film with steps of its own.
+
+An L-stable, stiffly accurate method (Hairer & Wanner, Solving Ordinary Differential Equations II, table IV.6.5); its
+stages are equilibria (`model.membrane.viscous`). Steps end where a history bends. The error of a step is the answer of
+the film to the difference to the embedded method of the third order, damped as the stages are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import Array
+from model.material.law import Evaluations, Film
+from model.membrane import ritz
+from model.membrane.ritz import Problem
+from model.membrane.solution import Status
+from model.membrane.viscous import Balance, Films, Instant, State, balance, flow, flow_slopes, slopes
+
+# The method's coefficients: nodes, matrix, and solution less embedded solution of the third order.
+NODES = (1 / 4, 3 / 4, 11 / 20, 1 / 2, 1.0)
+MATRIX = (
+    (),
+    (1 / 2,),
+    (17 / 50, -1 / 25),
+    (371 / 1360, -137 / 2720, 15 / 544),
+    (25 / 24, -49 / 48, 125 / 16, -85 / 12),
+)
+DIAGONAL = 1 / 4
+DEFECT = (-3 / 16, -27 / 32, 25 / 32, 0.0, 1 / 4)
+# The stages and the beginning of a step from which the first state of a stage is extrapolated; -2, -1: the last step's
+# middle and the beginning of this one. The first two begin anew after a bend.
+FROM = ((-3, -2, -1), (-2, -1, 0), (-1, 0, 1), (0, 1, 2), (-1, 3, 1))
+MIDDLE = 3
+
+SAFETY = 0.9  # of the step that the error estimate allows
+LEAST_FACTOR, MOST_FACTOR = 0.2, 4.0  # of the next step over the last
+STEP_SHARE = 0.3  # of the tolerance: error that one step may add, as many steps add up
+EMBEDDED_FACTOR = 0.1  # error of a step over the estimate, which is the embedded method's: held to the truth by tests
+FIRST_SHARE = 0.02  # of a stretch of the history: its first step
+MOST_REJECTED = 40  # steps in a row without success: there is no state
+LEAST_STEP = 1e-5  # of the shorter of a stretch of the history and the shortest relaxation time: the same
+GOAL, SLOPES_GOAL = 0.03, 10.0  # Newton's last change: of the tolerance, its square; with derivatives, times this
+
+
+def goal(tolerance: float, sensitivities: bool) -> float:
+    """Change at which Newton's method stops: its error is the square of it, that of derivatives of its order."""
+    found = max(1e-7, math.sqrt(GOAL * tolerance))
+    return max(1e-8, min(found, SLOPES_GOAL * tolerance)) if sensitivities else found
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Where a film is driven: times (s), displacement (m) and voltage (V) where they bend, (N,) each."""
+
+    t: Array
+    h: Array
+    voltage: Array
+
+
+@dataclass(slots=True)
+class Moment:
+    """Films at one time: viscous strains and rates (2, K, Q, M, S), packed states (D, S), derivatives of the first."""
+
+    viscous: Array
+    rate: Array
+    packed: Array
+    viscous_slopes: Array | None = None  # (2, K, Q, M, P, S)
+    rate_slopes: Array | None = None
+
+    def take(self, index: NDArray[np.intp]) -> Moment:
+        """The films at ``index``."""
+        two = (None if one is None else one[..., index] for one in (self.viscous_slopes, self.rate_slopes))
+        return Moment(self.viscous[..., index], self.rate[..., index], self.packed[..., index], *two)
+
+    def put(self, index: NDArray[np.bool_], other: Moment) -> Moment:
+        """These moments, and those of ``other`` where ``index``."""
+
+        def pick(one: Array | None, two: Array | None) -> Array | None:
+            return None if one is None or two is None else np.where(index, two, one)
+
+        return Moment(
+            np.where(index, other.viscous, self.viscous),
+            np.where(index, other.rate, self.rate),
+            np.where(index, other.packed, self.packed),
+            pick(self.viscous_slopes, other.viscous_slopes),
+            pick(self.rate_slopes, other.rate_slopes),
+        )
+
+
+@dataclass(slots=True)
+class Step:
+    """One step of every film that was still going, as the answers between its ends need it, (S,) and as `Moment`.
+
+    which : the films, by their number
+    ok : whether the step was taken
+    begin, dt : when it began, and its length (s)
+    before, after : the films at its ends
+    middle : packed states halfway, roughly
+    lam : dimensionless force at the end
+    defect, drift : estimated errors of the dimensionless force, and of the viscous strains on average
+    tail : error of the dimensionless force by the number of modes
+    error : estimated error of the force up to the end, over the largest force
+    """
+
+    which: NDArray[np.intp]
+    ok: NDArray[np.bool_]
+    begin: Array
+    dt: Array
+    before: Moment
+    after: Moment
+    middle: Array
+    lam: Array
+    defect: Array
+    drift: Array
+    tail: Array
+    error: Array
+
+
+def pack(films: Films, height: Array, state: State) -> Array:
+    """One column a film (D, S): what is smooth in time, the slopes over the height."""
+    size = len(height)
+    return np.concatenate((state.c, (state.w / height).reshape(-1, size), state.x.reshape(-1, size)))
+
+
+def unpack(films: Films, height: Array, packed: Array) -> State:
+    """The state of `pack` at another height."""
+    size = packed.shape[1]
+    grid = films.grid
+    n, points = grid.unknowns, grid.radius.shape[0] * grid.radius.shape[1]
+    w = packed[n : n + points].reshape(*grid.radius.shape[:2], size) * height
+    x = packed[n + points :].reshape(2, films.branches, *grid.radius.shape[:2], size)
+    return State(packed[:n], w, x)
+
+
+def _extrapolated(times: Sequence[Array], values: Sequence[Array], at: Array, fresh: NDArray[np.bool_]) -> Array:
+    """Parabola through three points in time, (S,) and (D, S); a line through the last two where ``fresh``."""
+    t0, t1, t2 = times
+    with np.errstate(all="ignore"):
+        w0 = (at - t1) * (at - t2) / ((t0 - t1) * (t0 - t2))
+        w1 = (at - t0) * (at - t2) / ((t1 - t0) * (t1 - t2))
+        line = (at - t2) / (t1 - t2)
+    line = np.where(t1 == t2, 0.0, line)
+    w0, w1 = np.where(fresh, 0.0, w0), np.where(fresh, line, w1)
+    found: Array = w0 * values[0] + w1 * values[1] + (1.0 - w0 - w1) * values[2]
+    return found
+
+
+class March:
+    """Films on their way, each through its own course."""
+
+    def __init__(self, films: Films, courses: Sequence[Course], tolerance: float, sensitivities: bool = False) -> None:
+        self.films, self.sensitivities = films, sensitivities
+        self.goal = goal(tolerance, sensitivities)
+        self.which = np.arange(len(courses))
+        self.courses = list(courses)
+        self.part = np.zeros(len(courses), dtype=np.intp)  # of its course that a film is on
+        self._bends()
+        self.now = self.left.copy()
+        self.moment = self._begin()
+        self.earlier: tuple[Array, Array] = (np.stack((self.now, self.now)), np.stack((self.moment.packed,) * 2))
+        self.fresh = np.ones(len(courses), dtype=np.bool_)
+
+    def _bends(self) -> None:
+        """Both ends of the part of its course that each film is on."""
+        ends = np.array(
+            [
+                [(c.t[k + j], c.h[k + j], c.voltage[k + j]) for j in (0, 1)]
+                for c, k in zip(self.courses, self.part.tolist(), strict=True)
+            ]
+        )
+        self.left, self.right = ends[:, 0, 0], ends[:, 1, 0]
+        self._from, self._to = ends[:, 0, 1:].T, ends[:, 1, 1:].T
+
+    def instant(self, t: Array) -> Instant:
+        """What drives the films at the times ``t`` (S,) of the part that they are on."""
+        share = (t - self.left) / (self.right - self.left)
+        h, voltage = self._from + share * (self._to - self._from)
+        return Instant(h, voltage)
+
+    def _begin(self) -> Moment:
+        """Films rested in their flat state, pushed in no time where a course does not begin there."""
+        films, instant = self.films, self.instant(self.now)
+        self.ok = np.ones(len(self.now), dtype=np.bool_)
+        shape = (2, films.branches, *films.grid.radius.shape)
+        viscous = np.broadcast_to(films.log_prestretch, shape).copy()
+        height = np.maximum(instant.height(films), 1e-3)
+        problem = Problem(Film(films.law, None, Evaluations()), films.log_prestretch, films.span, height)
+        guess = ritz.guess(problem, films.grid)
+        state = State(guess.c, guess.w * (instant.height(films) / height), np.zeros(shape))
+        rested = np.zeros_like(viscous)
+        moment = Moment(viscous, rested, pack(films, instant.height(films), state))
+        if self.sensitivities:
+            moment.viscous_slopes = np.zeros((*shape[:-1], films.columns, shape[-1]))
+            moment.viscous_slopes[..., -2, :] = 1.0
+            moment.rate_slopes = np.zeros_like(moment.viscous_slopes)
+        if not (instant.h != 0.0).any():
+            return moment
+        at = balance(films, instant, viscous, np.zeros_like(films.time), state, self.goal)
+        self.ok = at.ok | (instant.h == 0.0)
+        pushed = instant.h != 0.0
+        moment.rate = np.where(pushed, flow(films, at.state.x), 0.0)
+        moment.packed = np.where(pushed, pack(films, instant.height(films), at.state), moment.packed)
+        if moment.viscous_slopes is not None:
+            found = slopes(at, instant, moment.viscous_slopes)
+            moment.rate_slopes = np.where(pushed, flow_slopes(films, at, found.x, moment.rate), 0.0)
+        return moment
+
+    def take(self, keep: NDArray[np.intp]) -> None:
+        """Go on with these films alone, by their place among those that are still going."""
+        self.films = self.films.take(keep)
+        self.which, self.part, self.now = self.which[keep], self.part[keep], self.now[keep]
+        self.courses = [self.courses[k] for k in keep.tolist()]
+        self.moment = self.moment.take(keep)
+        self.earlier = (self.earlier[0][:, keep], self.earlier[1][..., keep])
+        self.fresh, self.ok = self.fresh[keep], self.ok[keep]
+        self._bends()
+
+    def step(self, dt: Array) -> Step:
+        """A step from now of the lengths ``dt`` (S,), which `accept` takes."""
+        films, now, moment = self.films, self.now, self.moment
+        lag = DIAGONAL * dt / films.time
+        times = {-3: self.earlier[0][0], -2: self.earlier[0][1], -1: now}
+        states = {-3: self.earlier[1][0], -2: self.earlier[1][1], -1: moment.packed}
+        rates: list[Array] = []
+        rate_slopes: list[Array] = []
+        ok = np.ones(len(dt), dtype=np.bool_)
+        start_slopes = None
+        for stage, (node, row) in enumerate(zip(NODES, MATRIX, strict=True)):
+            here = now + node * dt
+            instant = self.instant(here)
+            height = instant.height(films)
+            start = moment.viscous + dt * _sum(row, rates)
+            three = FROM[stage]
+            first = _extrapolated([times[k] for k in three], [states[k] for k in three], here, self.fresh & (stage < 2))
+            guess = unpack(films, height, first)
+            least = 0.2 * unpack(films, height, moment.packed).w
+            guess.w = np.where(guess.w > least, guess.w, 5.0 * least)
+            at = balance(films, instant, start, lag, guess, self.goal)
+            ok &= at.ok
+            times[stage], states[stage] = here, pack(films, height, at.state)
+            rates.append((at.u[:, None] - at.state.x - start) / (DIAGONAL * dt))
+            if moment.viscous_slopes is not None:
+                start_slopes = moment.viscous_slopes + dt * _sum(row, rate_slopes)
+                found = slopes(at, instant, start_slopes)
+                rate_slopes.append((found.viscous - start_slopes) / (DIAGONAL * dt))
+            if not ok.any():
+                return self.standing(np.nan)
+        after = Moment(start + DIAGONAL * dt * rates[-1], rates[-1], states[4])
+        if start_slopes is not None:
+            after.viscous_slopes, after.rate_slopes = start_slopes + DIAGONAL * dt * rate_slopes[-1], rate_slopes[-1]
+        defect = dt * _sum(DEFECT, rates)
+        lam, u, x = at.respond(0.0, defect[..., None, :])
+        off = np.abs(np.array(u)[:, None, ..., 0, :] - np.array(x)[..., 0, :] + defect)
+        drift = (films.ratio / (1.0 + films.ratio.sum(axis=0)) * off).sum(axis=1).mean(axis=(0, 1, 2))
+        error = np.zeros(len(dt))
+        return Step(
+            self.which,
+            ok,
+            now,
+            dt,
+            moment,
+            after,
+            states[MIDDLE],
+            at.lam,
+            np.abs(lam[0]),
+            drift,
+            at.tail * at.lam,
+            error,
+        )
+
+    def standing(self, value: float = 0.0) -> Step:
+        """No step: both its ends are now, and its numbers are ``value``."""
+        same = np.full(len(self.now), value)
+        ok = np.zeros(len(self.now), dtype=np.bool_)
+        m = self.moment
+        return Step(self.which, ok, self.now, same + 1.0, m, m, m.packed, same, same, same, same, same)
+
+    def accept(self, step: Step, taken: NDArray[np.bool_], end: Array) -> None:
+        """Go on to the ``end`` of a step where it is ``taken``."""
+        earlier = np.stack((self.now, self.now + 0.5 * step.dt)), np.stack((self.moment.packed, step.middle))
+        self.earlier = np.where(taken, earlier[0], self.earlier[0]), np.where(taken, earlier[1], self.earlier[1])
+        self.moment = self.moment.put(taken, step.after)
+        self.now = np.where(taken, end, self.now)
+        self.fresh &= ~taken
+
+    def turn(self) -> NDArray[np.bool_]:
+        """Go on to the next part of its course where a film has come to a bend; which films have."""
+        here = self.now >= self.right
+        if here.any():
+            last = np.array([self.part[k] + 2 == len(c.t) for k, c in enumerate(self.courses)])
+            self.part = np.where(here & ~last, self.part + 1, self.part)
+            self.fresh |= here
+            self._bends()
+        return here
+
+    def lost(self, place: int, converged: bool) -> Status:
+        """Why a film has no state after now: it hangs slack, is unstable under its voltage, or neither is sure."""
+        if converged:
+            return Status.NOT_CONVERGED
+        one = np.array([place])
+        films, moment, instant = self.films.take(one), self.moment.take(one), self.instant(self.now)
+        instant = Instant(instant.h[one], instant.voltage[one])
+        state = unpack(films, instant.height(films), moment.packed)
+        at: Balance = balance(films, instant, moment.viscous, np.zeros_like(films.time), state, self.goal)
+        law = at.points.law
+        if float(law.t1.min()) < 0.05 * float(law.t1.max()):
+            return Status.SLACK
+        return Status.UNSTABLE if float(instant.voltage[0]) != 0.0 else Status.NOT_CONVERGED
+
+
+def _sum(weights: Sequence[float], values: Sequence[Array]) -> Array:
+    total = np.zeros(1)
+    for weight, value in zip(weights, values, strict=True):
+        if weight != 0.0:
+            total = total + weight * value
+    return total
+
+
+@dataclass(slots=True)
+class Trail:
+    """What a march leaves behind: the steps, how many each film took and tried in vain, and where it ended.
+
+    begin : no step, but the films at their beginning
+    lost : by the film's number, the time after which it has no state, and why
+    """
+
+    begin: Step
+    steps: list[Step]
+    taken: NDArray[np.intp]
+    rejected: NDArray[np.intp]
+    lost: dict[int, tuple[float, Status]]
+
+
+def march(films: Films, courses: Sequence[Course], scale: Array, tolerance: float, sensitivities: bool) -> Trail:
+    """Every film to the end of its course, or as far as there are states.
+
+    scale : largest dimensionless force of each, (S,), over which errors are meant
+    """
+    allowed = STEP_SHARE * tolerance
+    on = March(films, courses, tolerance, sensitivities)
+    count = len(courses)
+    trail = Trail(on.standing(), [], np.zeros(count, dtype=np.intp), np.zeros(count, dtype=np.intp), {})
+    error, failures = np.zeros(count), np.zeros(count, dtype=np.intp)
+    shortest_time = films.time.min(axis=(0, 1, 2), initial=np.inf)
+    dt = FIRST_SHARE * (on.right - on.left)
+    for k in np.flatnonzero(~on.ok):
+        trail.lost[int(k)] = (-np.inf, Status.NOT_CONVERGED)
+    alive = on.ok.copy()
+    while True:
+        if not alive.all():
+            keep = np.flatnonzero(alive)
+            if len(keep) == 0:
+                return trail
+            on.take(keep)
+            dt, alive = dt[keep], alive[keep]
+        which = on.which
+        rest = on.right - on.now
+        whole = dt > 0.99 * rest
+        dt = np.where(whole, rest, np.minimum(dt, np.maximum(0.5 * rest, 1e-3 * dt)))
+        step = on.step(dt)
+        with np.errstate(invalid="ignore"):
+            wrong = np.maximum(step.defect / scale[which], step.drift)
+            size = np.where(step.ok & np.isfinite(wrong), wrong / allowed, np.inf)
+            factor = np.where(np.isfinite(size), SAFETY * np.maximum(size, 1e-12) ** -0.25, 0.25)
+        factor = np.clip(factor, LEAST_FACTOR, MOST_FACTOR)
+        taken = size <= 1.0
+        error[which] += np.where(taken, EMBEDDED_FACTOR * np.where(taken, wrong, 0.0), 0.0)
+        step.ok, step.error = taken, error[which] + step.tail / scale[which]
+        trail.steps.append(step)
+        trail.taken[which] += taken
+        trail.rejected[which] += ~taken
+        failures[which] = np.where(taken, 0, failures[which] + 1)
+        on.accept(step, taken, np.where(whole, on.right, on.now + dt))
+        dt = dt * np.where(taken, factor, np.minimum(factor, 0.7))
+        length = on.right - on.left
+        shortest = LEAST_STEP * np.minimum(length, shortest_time[which])
+        for k in np.flatnonzero(~taken & ((failures[which] > MOST_REJECTED) | (dt < shortest))):
+            trail.lost[int(which[k])] = (float(on.now[k]), on.lost(int(k), bool(np.isfinite(size[k]))))
+            alive[k] = False
+        ended = on.now >= np.array([c.t[-1] for c in on.courses])
+        alive &= ~ended
+        turned = on.turn()
+        dt = np.where(turned, FIRST_SHARE * (on.right - on.left), dt)
