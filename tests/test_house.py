@@ -31,6 +31,7 @@ LATE = {
     ("rig.run.backend", "rig.safety.remote"): "processes, where the supply is on a real port",
     ("rig.run.run", "rig.operator.remote"): "sockets, where there is an operator",
     ("rig.safety.start", "rig.safety.process"): "the guard's program, in the guard's process",
+    ("rig.sim.electrodes", "model.membrane.solve"): "the model, where a film is charged",
     ("rig.sim.film", "model.membrane.solve"): "the model, where a film is simulated",
     ("rig.sim.film", "model.stability.limits"): "the model, where a film is simulated under voltage",
 }

@@ -31,12 +31,13 @@ def command(scene: Path, protocol: Path) -> None:
 
     from rig.cli.show import show
     from rig.protocol.experiment import prepare
-    from rig.run.rehearse import check_instruments
+    from rig.run.rehearse import check_instruments, log_size
 
     experiment = prepare(scene, protocol)
     check_instruments(experiment)
+    size = log_size(experiment) if experiment.summaries else None
     page = max(shutil.get_terminal_size().lines - 8, 10) if sys.stdout.isatty() else PAGE
-    show(*pages(experiment, page), Text(summary(experiment)))
+    show(*pages(experiment, page), Text(summary(experiment, size)))
 
 
 def pages(experiment: Experiment, page: int) -> list[Table]:
@@ -77,8 +78,8 @@ def _rows(experiment: Experiment) -> Iterator[list[str]]:
         yield row
 
 
-def summary(experiment: Experiment) -> str:
-    """How long it takes, and how near it comes to the limits."""
+def summary(experiment: Experiment, log_bytes: int | None = None) -> str:
+    """How long it takes, how near it comes to the limits, and how long its log will be where that is known."""
     import math
 
     from rig.cli.show import minutes
@@ -98,4 +99,9 @@ def summary(experiment: Experiment) -> str:
     for limit, value in reached:
         allowed = f"of {limit.high * limit.per_si:g} allowed" if math.isfinite(limit.high) else "no limit"
         lines.append(f"  {limit.name:<13}{value * limit.per_si:.4g} {limit.unit}, {allowed}")
+    if log_bytes is not None:
+        lines.append(
+            f"  log          {log_bytes / 1e6:.4g} MB: {minutes(experiment.kept_s)} in full and summaries of "
+            f"{experiment.summaries} cycles"
+        )
     return "\n".join([*lines, "All hold."])

@@ -255,6 +255,12 @@ class Engine:
         self._check_devices()
         self._check_output()
 
+    def idle(self, seconds: float) -> None:
+        """Poll and record for so long, doing nothing: a rehearsal."""
+        end = self.clock.now() + seconds
+        while self.clock.now() < end:
+            self._turn()
+
     def _check_devices(self) -> None:
         """What the plan needs and these devices cannot do is refused while nothing has moved."""
         if self.guard is not None and self.rig.highest_voltage > 0:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from tempfile import SpooledTemporaryFile
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -36,6 +37,7 @@ from mcap.records import (
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "dea-rig"
 CHUNK_BYTES = 256 * 1024
+INDEX_IN_MEMORY = 1024 * 1024  # bytes of the index of chunks; a longer one waits for the end in a temporary file
 
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _INDEX_ENTRY = struct.Struct("<QQ")  # log time, offset in the chunk
@@ -57,7 +59,8 @@ class ContainerWriter:
         self._described: list[bytes] = []  # per channel: its schema and channel records
         self._counts: list[int] = []
         self._sequence: list[int] = []
-        self._chunk_indexes: list[ChunkIndex] = []
+        self._chunk_indexes = _Spool()
+        self._chunks = 0
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._first_ns: int | None = None
@@ -69,6 +72,11 @@ class ContainerWriter:
     def messages(self) -> int:
         """How many messages have been added."""
         return sum(self._counts)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far, the index that is still to come included."""
+        return self._offset + self._chunk_indexes.size
 
     @property
     def chunk_is_empty(self) -> bool:
@@ -145,7 +153,8 @@ class ContainerWriter:
         self._last_ns = max(self._last_ns, self._chunk_last_ns)
         self._clear_chunk()
         self._put(record + indexes)
-        self._chunk_indexes.append(index)
+        self._chunk_indexes.add(_record(index))
+        self._chunks += 1
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Write a file into the log, behind what was added before it."""
@@ -168,33 +177,33 @@ class ContainerWriter:
         self.end_chunk()
         self._put(_record(DataEnd(data_section_crc=self._crc)))
         start = self._offset
-        groups: list[tuple[int, list[Any]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
-            (Opcode.METADATA_INDEX, self._metadata_indexes),
+        groups: list[tuple[int, Iterable[bytes]]] = [
+            (Opcode.SCHEMA, map(_record, self._schemas)),
+            (Opcode.CHANNEL, map(_record, self._channels)),
+            (Opcode.STATISTICS, [_record(self._statistics())]),
+            (Opcode.CHUNK_INDEX, self._chunk_indexes.pieces()),
+            (Opcode.ATTACHMENT_INDEX, map(_record, self._attachment_indexes)),
+            (Opcode.METADATA_INDEX, map(_record, self._metadata_indexes)),
         ]
-        summary = b""
-        offsets = b""
+        offsets, crc = b"", 0
         for opcode, records in groups:
-            group = b"".join(_record(record) for record in records)
-            if group:
-                offsets += _record(SummaryOffset(opcode, start + len(summary), len(group)))
-            summary += group
-        offsets_start = start + len(summary)
-        summary += offsets
-        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offsets_start)
-        crc = zlib.crc32(head, zlib.crc32(summary))
-        self._put(summary + _record(Footer(start, offsets_start, crc)) + MAGIC)
+            begun = self._offset
+            for data in records:
+                self._put(data)
+                crc = zlib.crc32(data, crc)
+            if self._offset > begun:
+                offsets += _record(SummaryOffset(opcode, begun, self._offset - begun))
+        offsets_start = self._offset
+        footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offsets_start)
+        crc = zlib.crc32(footer, zlib.crc32(offsets, crc))
+        self._put(offsets + _record(Footer(start, offsets_start, crc)) + MAGIC)
 
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._channels),
             channel_message_counts=dict(enumerate(self._counts, 1)),
-            chunk_count=len(self._chunk_indexes),
+            chunk_count=self._chunks,
             message_count=self.messages,
             message_end_time=self._last_ns,
             message_start_time=self._first_ns or 0,
@@ -217,6 +226,37 @@ class ContainerWriter:
         self._sink(data)
         self._offset += len(data)
         self._crc = zlib.crc32(data, self._crc)
+
+
+class _Spool:
+    """Records that are wanted again at the end: what does not fit into memory waits in a temporary file."""
+
+    def __init__(self) -> None:
+        self._file = SpooledTemporaryFile(max_size=INDEX_IN_MEMORY)  # noqa: SIM115 # as long as this object
+        self.size = 0
+        self._size = 0
+        self._rest: list[bytes] = []  # once the file takes no more
+
+    def __del__(self) -> None:
+        self._file.close()
+
+    def add(self, data: bytes) -> None:
+        """Keep ``data`` behind what was kept before; never raises."""
+        self.size += len(data)
+        if not self._rest:
+            with suppress(OSError):
+                self._file.write(data)
+                self._size += len(data)
+                return
+        self._rest.append(data)
+
+    def pieces(self) -> Iterator[bytes]:
+        """All of it, in order."""
+        with suppress(OSError):  # an index with a hole is better than a log without an end
+            self._file.seek(0)
+            for begin in range(0, self._size, INDEX_IN_MEMORY):
+                yield self._file.read(min(INDEX_IN_MEMORY, self._size - begin))
+        yield from self._rest
 
 
 def _record(record: McapRecord) -> bytes:

@@ -56,6 +56,7 @@ class Recorder:
         self.has_laser = has_laser
         self.turn = 0.0  # when the loop's present turn began
         self.log_failed = False
+        self.keeping = True  # whether the log keeps everything: `rig.log.decimation`
         self._told_of_space = False
         self.best_effort = False  # on the way to the safe state a log that fails is no reason to stop
 
@@ -200,6 +201,15 @@ class Recorder:
             standard_uncertainty=standard_uncertainty,
             unit=unit,
         )
+
+    def cycle(self, fields: Mapping[str, object]) -> None:
+        """Write the summary of a cycle that has ended."""
+        self._write("/cycle", self._clock.now(), about=None, **fields)
+
+    def keep(self, keeping: bool, cause: str, before_s: float = 0.0) -> None:
+        """From here on write everything, and the last ``before_s`` seconds late; or leave out what cycling repeats."""
+        self.keeping = keeping
+        self._write("/kept", self._clock.now(), keeping=keeping, before_s=before_s, cause=cause)
 
     def units(self, force: str) -> None:
         """Write the unit of the force sensor's readings, which have none in their name, and all gains."""

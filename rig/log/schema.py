@@ -147,6 +147,45 @@ CHANNELS: dict[str, Channel] = {
             Field("unit", "string", "unit of value and uncertainty"),
         ),
     ),
+    "/cycle": Channel(
+        "Cycle",
+        (
+            _T,
+            Field("step", "fixed32", "index of the protocol step whose cycle ends here"),
+            Field("cycle", "sfixed64", "its number within the step, from 1; a run taken up again goes on counting"),
+            Field("whole", "bool", "false for one that a pause or the end of the run cut short: it is not counted"),
+            Field("kept", "bool", "true where samples and bytes of the whole cycle are in this log"),
+            Field("begin_s", "double", "clock time at which it began, seconds since the start of the run"),
+            Field("samples", "fixed32", "samples of the force in it"),
+            Field("force_valley_N", "double", "smallest force measured, in newtons"),
+            Field("force_peak_N", "double", "largest force measured, in newtons"),
+            Field("displacement_valley_m", "double", "smallest displacement measured, in metres"),
+            Field("displacement_peak_m", "double", "largest displacement measured, in metres"),
+            Field("voltage_valley_V", "double", "smallest voltage measured, in volts; NaN without a supply"),
+            Field("voltage_peak_V", "double", "largest voltage measured, in volts; NaN without a supply"),
+            Field("current_valley_A", "double", "smallest current measured, in amperes; NaN where it is not measured"),
+            Field("current_peak_A", "double", "largest current measured, in amperes; NaN where it is not measured"),
+            Field("stiffness_N_per_m", "double", "slope of force over displacement by least squares, where it cycles"),
+            Field("actuation_N_per_V2", "double", "slope of force over voltage squared, likewise"),
+            Field("work_J", "double", "area of the loop of force and displacement: what the film has dissipated"),
+            Field("electric_J", "double", "voltage times current over the cycle; NaN where it is not measured"),
+            Field("leakage_A", "double", "mean current while voltage and disk stand still at the top; NaN without"),
+        ),
+    ),
+    "/kept": Channel(
+        "Kept",
+        (
+            _T,
+            Field(
+                "keeping",
+                "bool",
+                "whether everything is written from here on; else samples, bytes, commands of "
+                "cycling and its targets are left out until the next such message",
+            ),
+            Field("before_s", "double", "how many seconds before are written behind this message, late"),
+            Field("cause", "string", "why: the rule of the step, or what happened"),
+        ),
+    ),
     "/command": Channel(
         "Command",
         (

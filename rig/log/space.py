@@ -14,11 +14,13 @@ WARN_FREE = 256 * 10**6
 # chunks. A run of the examples takes half of what follows from them.
 _BYTES_PER_SAMPLE = {"stage": 360, "force": 120, "displacement": 360, "hv": 1200}
 _BYTES_PER_SECOND = 20_000
+_BYTES_PER_SUMMARY = 1500  # of a cycle that fills a chunk alone
 
 
-def needed(seconds: float, rates: Mapping[str, float]) -> int:
-    """Bytes that a log of ``seconds`` may take, with samples at ``rates`` (Hz) by role."""
-    return round(seconds * (_BYTES_PER_SECOND + sum(_BYTES_PER_SAMPLE[role] * rate for role, rate in rates.items())))
+def needed(seconds: float, rates: Mapping[str, float], summaries: int = 0) -> int:
+    """Bytes that ``seconds`` of samples at ``rates`` (Hz) by role may take, and so many cycles' summaries."""
+    per_second = _BYTES_PER_SECOND + sum(_BYTES_PER_SAMPLE[role] * rate for role, rate in rates.items())
+    return round(seconds * per_second + summaries * _BYTES_PER_SUMMARY)
 
 
 def free(folder: Path) -> int:
@@ -26,9 +28,9 @@ def free(folder: Path) -> int:
     return shutil.disk_usage(folder).free
 
 
-def check(path: Path, seconds: float, rates: Mapping[str, float]) -> None:
+def check(path: Path, seconds: float, rates: Mapping[str, float], summaries: int = 0) -> None:
     """Raise `LogError` when the disk of ``path`` has too little room for the log of a run."""
-    size = needed(seconds, rates)
+    size = needed(seconds, rates, summaries)
     try:
         room = free(path.parent)
     except OSError as error:

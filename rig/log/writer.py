@@ -12,12 +12,16 @@ from typing import Any, Self
 from rig.log import schema, space
 from rig.log.checks import Checks
 from rig.log.container import ContainerWriter
+from rig.log.decimation import KEPT, Decimation
 from rig.log.errors import LogError
 from rig.log.part_file import PartFile
 
 # A chunk is written when its first message is this old, so that a loop that ticks every 20 ms or faster
 # never has more than 100 ms of samples in memory.
 CHUNK_SECONDS = 0.08
+# Where most is left out, a chunk a cycle would make an index as large as the log. So much a power cut may take along;
+# the end of the process that records takes nothing, since another one writes.
+SPARSE_CHUNK_SECONDS = 2.0
 FREE_SECONDS = 1.0
 PLACE_SECONDS = 0.5  # how often it is looked whether the file is still where it was made
 
@@ -58,6 +62,7 @@ class LogWriter:
         self._next_look = -math.inf
         self._channels: dict[str, int] = {}
         self._checks = Checks(path)
+        self._decimation = Decimation()
         self._next_place = -math.inf
         self._chunk_since: float | None = None
         self._ended = False
@@ -74,6 +79,11 @@ class LogWriter:
     def part(self) -> Path:
         """Where the log is until it is finished."""
         return self._file.part
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far, with the index that it ends with."""
+        return self._container.size
 
     def write(self, topic: str, fields: Mapping[str, Any], log_ns: int, publish_ns: int) -> None:
         """Record one message.
@@ -93,6 +103,13 @@ class LogWriter:
     def add(self, topic: str, data: bytes, log_ns: int, publish_ns: int) -> None:
         """`write` of a message that `rig.log.checks.Checks` has encoded."""
         self._file.check()
+        if self._decimation.keeping and topic != KEPT:  # nearly always
+            self._put(topic, data, log_ns, publish_ns)
+            return
+        for row in self._decimation.take((topic, data, log_ns, publish_ns)):
+            self._put(*row)
+
+    def _put(self, topic: str, data: bytes, log_ns: int, publish_ns: int) -> None:
         channel = self._channels.get(topic)
         if channel is None:
             channel = self._container.add_channel(topic, schema.schema_name(topic), schema.schema_data(topic))
@@ -116,7 +133,7 @@ class LogWriter:
             self._chunk_since = None
         elif self._chunk_since is None:
             self._chunk_since = now
-        elif not now - self._chunk_since < CHUNK_SECONDS:
+        elif not now - self._chunk_since < (CHUNK_SECONDS if self._decimation.keeping else SPARSE_CHUNK_SECONDS):
             self._container.end_chunk()
             self._chunk_since = None
         return self._free

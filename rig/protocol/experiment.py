@@ -68,6 +68,16 @@ class Experiment:
         """Planned duration in seconds."""
         return sum(action.duration for action in self.actions)
 
+    @property
+    def kept_s(self) -> float:
+        """Seconds of it of which the log keeps everything."""
+        return sum(action.kept_s for action in self.actions)
+
+    @property
+    def summaries(self) -> int:
+        """How many summaries of cycles the log will have."""
+        return sum(action.summaries for action in self.actions)
+
 
 def prepare(scene_path: Path, protocol_path: Path, ports: dict[str, dict[str, object]] | None = None) -> Experiment:
     """Load and check everything; touches no hardware.

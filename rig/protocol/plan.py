@@ -6,7 +6,7 @@ anything moves (`rig.protocol.predict`), and what the engine then carries out.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from rig.base.errors import ConfigError, LimitError
 from rig.protocol.protocol import Protocol
@@ -14,9 +14,12 @@ from rig.scene.scene import Scene
 from rig.steps.base import Action, OnResume, State, Step
 from rig.steps.prompt import ask_first
 from rig.steps.regain import Regain
+from rig.steps.rig import CyclesDone
 
 MOST_ACTIONS = 50_000  # a protocol of more is a slip: so many moves take days
 LONGEST_S = 90 * 86_400.0
+
+CYCLES, REFERENCE = "cycles_done", "cycle_response_reference"  # in the metadata ``resumed`` of a log
 
 
 def plan(protocol: Protocol, scene: Scene) -> list[Action]:
@@ -34,14 +37,30 @@ def plan(protocol: Protocol, scene: Scene) -> list[Action]:
 
 
 def plan_resumed(
-    protocol: Protocol, scene: Scene, first: int, still_valid: Collection[int], question: str
+    protocol: Protocol,
+    scene: Scene,
+    first: int,
+    still_valid: Collection[int],
+    question: str,
+    done: CyclesDone | None = None,
 ) -> list[Action]:
     """What a resumed run does: the question whether all is as it was, and the rest of the protocol (`plan_from`)."""
-    return [ask_first(first, question), *plan_from(protocol, scene, first, still_valid)]
+    return [ask_first(first, question), *plan_from(protocol, scene, first, still_valid, done)]
 
 
-def plan_from(protocol: Protocol, scene: Scene, first: int, skipped: Collection[int] = ()) -> list[Action]:
+def earlier_cycles(resumed: Mapping[str, str]) -> CyclesDone | None:
+    """What the metadata ``resumed`` of a log says that the run before it had counted; ValueError for what is none."""
+    if CYCLES not in resumed:
+        return None
+    return CyclesDone(int(resumed[CYCLES]), float(resumed.get(REFERENCE, "nan")))
+
+
+def plan_from(
+    protocol: Protocol, scene: Scene, first: int, skipped: Collection[int] = (), done: CyclesDone | None = None
+) -> list[Action]:
     """The actions from step ``first`` on, with what has to be done again before it.
+
+    ``done`` is what had been counted of step ``first``.
 
     Of the steps before, those are done again that say so (`OnResume`), but for the steps ``skipped``; then the
     displacement and the voltage are regained with which the step begins.
@@ -65,7 +84,7 @@ def plan_from(protocol: Protocol, scene: Scene, first: int, skipped: Collection[
     before: list[tuple[int, Step]] = sorted(_again(numbered[: first - 1], skipped).items())
     if begin.h[0] > 0 or begin.voltage[0] > 0:
         before.append((first, Regain(h=begin.h[0], voltage=begin.voltage[0])))
-    return list(_actions([*before, *numbered[first - 1 :]], scene))
+    return list(_actions([*before, *numbered[first - 1 :]], scene, {} if done is None else {first: done}))
 
 
 def _again(done: list[tuple[int, Step]], skipped: Collection[int]) -> dict[int, Step]:
@@ -82,11 +101,13 @@ def _again(done: list[tuple[int, Step]], skipped: Collection[int]) -> dict[int, 
     return again
 
 
-def _actions(numbered: Iterable[tuple[int, Step]], scene: Scene) -> Iterator[Action]:
+def _actions(
+    numbered: Iterable[tuple[int, Step]], scene: Scene, done: Mapping[int, CyclesDone] | None = None
+) -> Iterator[Action]:
     state = State()
     count, seconds = 0, 0.0
     for number, step in numbered:
-        state.number = number
+        state.number, state.done = number, (done or {}).get(number)
         where, highest = step.where(number), step.highest_voltage
         if highest > 0 and scene.hv is None:
             raise LimitError(f"{where} asks for {highest:g} V, but the scene has no [hv] instrument.")

@@ -15,10 +15,11 @@ from rig.base.errors import ConfigError, LimitError
 from rig.base.toml_file import parse_table
 from rig.log import schema
 from rig.log.contents import ON_PORTS, ON_SERVED_PORTS, bench_of, certificates_in
+from rig.log.decimation import KEPT
 from rig.log.errors import LogError
 from rig.log.reader import Log, read_log
 from rig.protocol.experiment import Experiment
-from rig.protocol.plan import plan, plan_resumed
+from rig.protocol.plan import earlier_cycles, plan, plan_resumed
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import Scene
 from rig.steps.base import Action
@@ -99,9 +100,10 @@ class Recording:
         try:
             first = int(resumed["at_step"])
             still_valid = {int(step) for step in resumed.get("preconditioning_still_valid", "").split()}
+            done = earlier_cycles(resumed)
         except (KeyError, ValueError):
             raise LogError(self.log.path, "does not say at which step it was resumed") from None
-        return plan_resumed(protocol, scene, first, still_valid, "Is all as the other run left it?")
+        return plan_resumed(protocol, scene, first, still_valid, "Is all as the other run left it?", done)
 
     @cached_property
     def certificates(self) -> dict[str, Certificate]:
@@ -191,6 +193,11 @@ def load_recording(path: Path) -> Recording:
             problem = "something is missing after that"
             break
         rows += chunk
+    left_out = next((k for k, row in enumerate(rows) if row.topic == KEPT and not row.fields["keeping"]), None)
+    if left_out is not None:
+        at = rows[left_out].t
+        del rows[left_out:]
+        return Recording(log, rows, f"from {at:.3f} s on the log keeps cycles by a rule and not every byte")
     if log.gaps:
         gap = log.gaps[0]
         problem = f"{problem or 'damaged'}; bytes {gap.start} to {gap.end} of the file: {gap.reason}"

@@ -1,17 +1,26 @@
-"""What a run would refuse when it meets its instruments, asked of the simulated ones before."""
+"""What a run would refuse when it meets its instruments, and how long its log will be: asked of the simulated ones."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+import math
+import random
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import cast
 
+from rig.bench.bench import Bench
 from rig.engine.engine import Engine
+from rig.log import schema
+from rig.log.container import ContainerWriter
 from rig.log.nowhere import NoLog
+from rig.log.writer import SPARSE_CHUNK_SECONDS, LogWriter
 from rig.operator.control import Control
 from rig.protocol.experiment import Experiment, gains_of
 from rig.run.backend import open_bench
 
-if TYPE_CHECKING:
-    from rig.log.writer import LogWriter
+REHEARSED_S, REHEARSED_M_PER_S = 4.0, 1e-3
+REHEARSED_CHUNKS = 30
 
 
 def check_instruments(experiment: Experiment) -> None:
@@ -25,18 +34,73 @@ def check_instruments(experiment: Experiment) -> None:
     RigError, drivers.links.link.DeviceError
         What the run would end with before its first step.
     """
-    if experiment.scene.on_real_ports or experiment.scene.bench is not None:
+    if not _can_be_rehearsed(experiment):
         return
-    bench = open_bench(experiment.scene)
-    try:
-        Engine(
-            bench,
-            experiment.actions,
-            cast("LogWriter", NoLog()),
-            gains_of(experiment.certificates),
-            Control(unattended="a check"),
-            lambda done, total, label: None,
-            experiment.certificates,
-        ).set_up()
-    finally:
-        bench.close()
+    with closing(open_bench(experiment.scene)) as bench:
+        _engine(experiment, bench, NoLog()).set_up()
+
+
+def log_size(experiment: Experiment) -> int | None:
+    """Bytes that the log of the experiment will have, within some per cent; None where it cannot be rehearsed.
+
+    Of the seconds in which everything is kept, by a few seconds of the simulated bench, its stage moving; of the
+    summaries of cycles, by writing some. Attachments and what happens once count for nothing beside them.
+    """
+    if not _can_be_rehearsed(experiment):
+        return None
+    size = experiment.kept_s * _bytes_per_second(experiment)
+    for action in experiment.actions:
+        if action.summaries:
+            size += action.summaries * _bytes_per_summary(action.duration / action.summaries)
+    return round(size)
+
+
+def _bytes_per_second(experiment: Experiment) -> float:
+    with TemporaryDirectory() as folder, closing(open_bench(experiment.scene)) as bench:
+        log = LogWriter(Path(folder) / "rehearsal.mcap")
+        with log:
+            engine = _engine(experiment, bench, log)
+            engine.set_up()
+            before, begun = log.size, bench.clock.now()
+            if bench.simulated is not None:
+                stage, contact = bench.simulated.world.stage, bench.simulated.settings.contact_position_mm * 1e-3
+                stage.rest(begun, contact)
+                stage.ramp(begun + 1e-3, contact + REHEARSED_S * REHEARSED_M_PER_S, REHEARSED_M_PER_S)
+            engine.idle(REHEARSED_S)
+            return (log.size - before) / (bench.clock.now() - begun)
+
+
+def _bytes_per_summary(period: float) -> float:
+    """By as many as are written, a chunk at a time, with numbers that no compression shortens."""
+    sizes: list[int] = []
+    container = ContainerWriter(lambda data: sizes.append(len(data)))
+    channel = container.add_channel("/cycle", schema.schema_name("/cycle"), schema.schema_data("/cycle"))
+    rng, fields = random.Random(1), schema.CHANNELS["/cycle"].fields
+    a_chunk = max(math.ceil(SPARSE_CHUNK_SECONDS / period), 1)
+    before, count = sum(sizes), 0
+    for _ in range(REHEARSED_CHUNKS):
+        for _ in range(a_chunk):
+            count += 1
+            t = round(count * period * 1e9)
+            row = {f.name: rng.random() if f.type == "double" else f.type == "bool" and count for f in fields}
+            row |= {"cycle": count, "step": 4, "samples": 100, "whole": True, "kept": False}
+            container.add_message(channel, schema.encode("/cycle", row), t, t)
+        container.end_chunk()
+    container.finish()
+    return (sum(sizes) - before) / count
+
+
+def _can_be_rehearsed(experiment: Experiment) -> bool:
+    return not experiment.scene.on_real_ports and experiment.scene.bench is None
+
+
+def _engine(experiment: Experiment, bench: Bench, log: LogWriter | NoLog) -> Engine:
+    return Engine(
+        bench,
+        experiment.actions,
+        cast("LogWriter", log),
+        gains_of(experiment.certificates),
+        Control(unattended="a check"),
+        lambda done, total, label: None,
+        experiment.certificates,
+    )

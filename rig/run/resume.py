@@ -9,6 +9,7 @@ sensor's zero must still be near the one taken then.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,10 +23,11 @@ from rig.base.toml_file import parse_table, validate
 from rig.log.contents import IN_MEMORY, bench_of, bench_word, certificates_in, identities_in
 from rig.log.reader import Log, read_log
 from rig.protocol.experiment import Experiment, are_served
-from rig.protocol.plan import plan, plan_resumed
+from rig.protocol.plan import CYCLES, REFERENCE, earlier_cycles, plan, plan_resumed
 from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import Scene
+from rig.steps.rig import CyclesDone
 
 
 def prepare_resumed(
@@ -64,7 +66,8 @@ def prepare_resumed(
         f"of {ended} left it, and nothing in the way of the stage, which finds its reference position first?"
     )
     certificates = _certificates(log)
-    actions = plan_resumed(protocol, scene, first, still_valid, question)
+    done = cycles_done(log, first)
+    actions = plan_resumed(protocol, scene, first, still_valid, question, done)
     plan(protocol, scene)  # what is left must belong to a protocol that can be carried out
     experiment = Experiment(
         scene,
@@ -80,6 +83,7 @@ def prepare_resumed(
             "scene_sha256": hashlib.sha256(scene_text.encode()).hexdigest(),
             "at_step": str(first),
             "preconditioning_still_valid": " ".join(map(str, sorted(still_valid))),
+            **({} if done is None else {CYCLES: str(done.count), REFERENCE: repr(done.reference)}),
         },
         stored_zero=_force_zero(log),
         served=served,
@@ -140,6 +144,22 @@ def _still_valid(log: Log, protocol: Protocol, first: int, now_ns: int) -> set[i
         if later and 0 <= now_ns - later[0] <= step.valid_for_s * 1e9:
             found.add(number)
     return found
+
+
+def cycles_done(log: Log, step: int) -> CyclesDone | None:
+    """What the run of ``log`` had counted of a step of cycles, with what it had taken over from an earlier one."""
+    earlier = log.metadata.get("resumed", {})
+    found = earlier_cycles(earlier) if earlier.get("at_step") == str(step) else None
+    count, reference = (0, math.nan) if found is None else (found.count, found.reference)
+    for message in log.messages("/cycle"):
+        if message.fields["step"] == step and message.fields["whole"]:
+            count = max(count, message.fields["cycle"])
+    phases = [(m.log_ns, m.fields["step"]) for m in log.messages("/phase")]
+    for message in log.messages("/reference"):
+        began = [number for ns, number in phases if ns <= message.log_ns]
+        if message.fields["name"] == "cycle_response" and began[-1:] == [step]:
+            reference = message.fields["value"]
+    return CyclesDone(count, reference) if count else None
 
 
 def _force_zero(log: Log) -> float | None:

@@ -80,7 +80,7 @@ def run(
             "cannot do that. It is for simulated benches: ports count as simulated when they come from the file that "
             "`dea-rig sim` printed, by --ports. Nothing was touched."
         )
-    space.check(out, experiment.duration, experiment.scene.rates)
+    space.check(out, experiment.kept_s, experiment.scene.rates, experiment.summaries)
     backend = Backend(experiment.scene)
     bench = backend.bench
     engine: Engine | None = None

@@ -192,6 +192,10 @@ class World:
         extra = self.extra_leakage if voltage > 0 else 0.0
         return self._charging(self._electrodes, t, slope) + voltage / self.film_resistance + extra
 
+    def read_current(self, t: float) -> float:
+        """`current` as the supply's monitor has it (A), noise left to the supply."""
+        return self.current(t) * (1.0 + (self._electrodes.current_gain_error if self._electrodes is not None else 0.0))
+
     def _charging(self, electrodes: OutputTruth, t: float, slope: float) -> float:
         """dQ/dt (A), Q = C V: also of a film that is moved at a constant voltage."""
         if not electrodes.capacitance_of_film:

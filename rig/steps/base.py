@@ -20,7 +20,7 @@ from model.specimen import Specimen
 from rig.base.table import Table
 from rig.safety.limits import Limits
 from rig.scene.scene import Scene
-from rig.steps.rig import Rig
+from rig.steps.rig import CyclesDone, Rig
 
 Turns = Generator[None, None, None]
 
@@ -60,6 +60,7 @@ class State:
     homed: bool = False
     zeroed: bool = False
     contact: bool = False
+    done: CyclesDone | None = None  # of the step that is being planned, by the run that this one goes on with
 
 
 class Step(Table, ABC):
@@ -201,6 +202,16 @@ class Action(ABC):
         ------
         LimitError
         """
+
+    @property
+    def kept_s(self) -> float:
+        """Seconds of it of which the log keeps everything."""
+        return self.duration
+
+    @property
+    def summaries(self) -> int:
+        """How many summaries of cycles it writes to the log."""
+        return 0
 
     @abstractmethod
     def carry_out(self, rig: Rig) -> Turns:

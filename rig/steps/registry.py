@@ -20,6 +20,7 @@ from rig.base.errors import ConfigError
 from rig.steps.approach import Approach
 from rig.steps.base import Step
 from rig.steps.breakdown import Breakdown
+from rig.steps.cycle import Cycle
 from rig.steps.follow import Follow
 from rig.steps.glide import Glide
 from rig.steps.hold import Hold
@@ -61,6 +62,7 @@ OWN: Mapping[str, type[Step]] = {
         Sweep,
         Relax,
         Breakdown,
+        Cycle,
         Return,
         Follow,
         Mount,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from drivers.roles import Sample
 from rig.base.errors import FaultError
@@ -19,6 +19,14 @@ from rig.safety.arming import Arming
 from rig.safety.guard import AnyGuard, GuardState
 from rig.safety.limits import Limits
 from rig.steps.hands import Hands
+
+
+@dataclass(frozen=True)
+class CyclesDone:
+    """What a run that ended early had counted of a step: whole cycles, and what counts as 100 % of their response."""
+
+    count: int
+    reference: float
 
 
 class Rig:
@@ -43,6 +51,8 @@ class Rig:
         Told every sample as it arrives.
     on_readings : callable
         ``on_readings(role, readings)`` is told the readings of an unloaded sensor.
+    counts : dict
+        What a step has counted, by its number: it outlives the operator's pause.
     hands : Hands or None
         Who does what the operator is asked to do by hand, on the simulated bench in memory; else the operator himself.
     """
@@ -73,6 +83,7 @@ class Rig:
         self.question_number = ""  # which of the plan's questions is asked next ("3 of 34")
         self.listener: Callable[[Sample], None] | None = None
         self.on_readings: Callable[[str, Sequence[float]], None] = lambda role, readings: None
+        self.counts: dict[int, CyclesDone] = {}
         self.hands: Hands | None = None if bench.simulated is None else bench.simulated.operator
 
     @property

@@ -335,9 +335,7 @@ class IsegEDCP:
     def _measured_i(self, t: float) -> float:
         if self._frozen is not None:
             return self._frozen[1]
-        current = min(max(self._world.current(t), 0.0), 1.2 * self.nominal_i)
-        if self._settings.current_gain_error:
-            current *= 1.0 + self._settings.current_gain_error
+        current = min(max(self._world.read_current(t), 0.0), 1.2 * self.nominal_i)
         return current + self._settings.current_noise_nA * 1e-9 * self._i_noise.at(t)
 
     def _channel_status(self, channel: _Channel) -> int:

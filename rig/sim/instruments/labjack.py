@@ -415,8 +415,7 @@ class Amplifier:
             if s.monitor_unplugged:
                 return 0.0
             return math.copysign(self._world.output.at(t)[0], s.gain_V_per_V) / s.monitor_V_per_V
-        current = self._world.current(t) * (1.0 + self._truth.current_gain_error)
-        return math.copysign(1.0, s.gain_V_per_V) * current * 1e6 / s.monitor_uA_per_V
+        return math.copysign(1.0, s.gain_V_per_V) * self._world.read_current(t) * 1e6 / s.monitor_uA_per_V
 
     def _input(self, channel: int, t: float) -> float:
         if self._rail:

@@ -29,7 +29,7 @@ def test_same_calls_same_bytes(write_log, tmp_path):
 def test_nothing_of_the_host_in_the_file(small):
     content = small.read_bytes()
     for fact in (os.uname().nodename, str(small.parent), "mcap-python"):
-        assert fact.encode() not in content
+        assert len(fact) < 4 or fact.encode() not in content  # shorter ones come by chance
 
 
 def test_the_stock_reader_reads_it(small, samples):
@@ -221,7 +221,7 @@ def full_after(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(part_file.os, "write", write)
 
 
-@pytest.mark.parametrize("limit", [9_500, 9_501, 11_777, 20_000])
+@pytest.mark.parametrize("limit", [11_500, 11_501, 13_777, 20_000])
 def test_a_full_disk_ends_the_log_for_good(tmp_path, monkeypatch, limit):
     path = tmp_path / "a.mcap"
     full_after(limit, monkeypatch)

@@ -50,6 +50,7 @@ LEAST: dict[str, tuple[str, dict[str, Any]]] = {
     "sweep": ("contact", {"displacement_mm": 4.0, "speed_mm_per_s": 1.0, "voltages_V": [0.0, 500.0]}),
     "relax": ("contact", {"displacements_mm": [2.0, 4.0], "speed_mm_per_s": 5.0, "hold_s": 30.0, "voltage_V": 500.0}),
     "breakdown": ("contact", {"ceiling_V": 1500.0}),
+    "cycle": ("contact", {"to_mm": 4.0, "period_s": 20.0, "cycles": 100, "waveform": "trapezoid"}),
     "return": ("raised", {}),
     "follow": ("contact", {"bias": SPRING, "voltages_V": [500.0]}),
     "mount": ("nothing", {"fixture": "none"}),
@@ -72,6 +73,21 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "sweep": {"from_mm": 0.0, "voltages_V": [0.0], "cycles": 1, "settle_s": 1.0},
     "relax": {"voltage_V": 0.0, "voltage_after": 0.5},
     "breakdown": {"rate_V_per_s": None, "hold_s": 0.0},
+    "cycle": {
+        "waveform": "triangle",
+        "from_mm": 0.0,
+        "to_mm": None,
+        "from_V": 0.0,
+        "to_V": None,
+        "rest_share": 0.25,
+        "cycles": None,
+        "hours": None,
+        "keep_every": 0,
+        "reference_cycle": 10,
+        "stop_below_percent": None,
+        "stop_above_percent": None,
+        "stop_leakage_nA": None,
+    },
     "return": {"speed_mm_per_s": 2.0, "clearance_mm": 2.0},
     "follow": {"rate_Hz": 40.0, "speed_mm_per_s": 1.0, "settle_s": 1.0, "average_s": 5.0, "patience_s": 60.0},
     "mount": {},
@@ -151,6 +167,22 @@ MOVES: dict[str, dict[str, tuple[Any, set[str]]]] = {
         "rate_V_per_s": (100.0, {"label", "duration", "rate"}),
         "hold_s": (5.0, {"duration", "hold"}),
     },
+    "cycle": {
+        "waveform": ("triangle", {"speed", "rise_s"}),
+        "from_mm": (1.0, {"number"}),  # a way there
+        "to_mm": (3.0, {"label", "h", "speed"}),
+        "from_V": (10.0, {"number"}),
+        "to_V": (700.0, {"label", "voltage"}),
+        "period_s": (30.0, {"label", "duration", "speed", "rise_s"}),
+        "rest_share": (0.3, {"speed", "rise_s"}),
+        "cycles": (50, {"label", "duration"}),
+        "hours": (2.0, {"label", "duration"}),
+        "keep_every": (7, set()),  # of the log, not of the plan
+        "reference_cycle": (20, set()),
+        "stop_below_percent": (80.0, set()),
+        "stop_above_percent": (120.0, set()),
+        "stop_leakage_nA": (50.0, set()),
+    },
     "return": {
         "speed_mm_per_s": (1.0, {"duration", "speed"}),
         "clearance_mm": (3.0, {"h", "duration"}),
@@ -215,6 +247,13 @@ MOVES: dict[str, dict[str, tuple[Any, set[str]]]] = {
         "speed_mm_per_s": (2.0, {"speed"}),
     },
 }
+# Keys that exclude each other: what else is given where one of these is.
+BY_VOLTAGE, BY_TIME = {"to_mm": None, "to_V": 600.0}, {"cycles": None, "hours": 1.0}
+INSTEAD: dict[tuple[str, str], dict[str, Any]] = {
+    ("cycle", "from_V"): BY_VOLTAGE,
+    ("cycle", "to_V"): BY_VOLTAGE,
+    ("cycle", "hours"): BY_TIME,
+}
 TINY = 1e-9
 # Values that are just allowed, and values just beyond.
 NOT_NEGATIVE, POSITIVE = ([0.0], [-TINY]), ([TINY], [0.0, -1.0])
@@ -251,6 +290,22 @@ BOUNDS: dict[str, dict[str, tuple[list[Any], list[Any]]]] = {
         "voltage_after": ([TINY, 1.0 - TINY], [0.0, 1.0]),
     },
     "breakdown": {"ceiling_V": POSITIVE, "rate_V_per_s": POSITIVE, "hold_s": NOT_NEGATIVE},
+    "cycle": {
+        "waveform": (["triangle", "trapezoid", "square"], ["sine", "saw", ""]),  # no stage follows a sine
+        "from_mm": ([0.0, 4.0 - TINY], [-TINY, 4.0]),
+        "to_mm": POSITIVE,
+        "from_V": ([0.0, 600.0 - TINY], [-TINY, 600.0]),
+        "to_V": POSITIVE,
+        "period_s": POSITIVE,
+        "rest_share": ([TINY, 0.5 - TINY], [0.0, 0.5]),
+        "cycles": ([1, 10**9], [0, 10**9 + 1, 1.5]),
+        "hours": ([20.0 / 3600.0 + TINY], [0.0, 20.0 / 3600.0 - 1e-6]),
+        "keep_every": ([0, 10**9], [-1, 10**9 + 1]),
+        "reference_cycle": ([1, 10**6], [0, 10**6 + 1]),
+        "stop_below_percent": ([TINY, 100.0 - TINY], [0.0, 100.0]),
+        "stop_above_percent": ([100.0 + TINY, 1000.0 - TINY], [100.0, 1000.0]),
+        "stop_leakage_nA": POSITIVE,
+    },
     "return": {"speed_mm_per_s": POSITIVE, "clearance_mm": NOT_NEGATIVE},
     "follow": {
         "bias": ([SPRING, {"kind": "mass", "weight_N": TINY}], [{"kind": "lever"}, {"kind": "mass", "weight_N": 0.0}]),
@@ -362,7 +417,8 @@ def test_each_default_is_the_documented_one(do: str) -> None:
 @pytest.mark.parametrize(("do", "key"), KEYS)
 def test_each_key_moves_its_part_of_the_plan_and_no_other(do: str, key: str, scene: Any) -> None:
     value, expected = MOVES[do][key]
-    before, after = actions_of(do, scene), actions_of(do, scene, **{key: value})
+    instead = INSTEAD.get((do, key), {})
+    before, after = actions_of(do, scene, **instead), actions_of(do, scene, **{**instead, key: value})
     if "number" in expected:
         assert len(before) != len(after)
     else:
@@ -371,7 +427,7 @@ def test_each_key_moves_its_part_of_the_plan_and_no_other(do: str, key: str, sce
 
 @pytest.mark.parametrize(("do", "key"), KEYS)
 def test_each_bound_is_accepted_at_and_refused_beyond(do: str, key: str) -> None:
-    step, least = registry.OWN[do], LEAST[do][1]
+    step, least = registry.OWN[do], LEAST[do][1] | INSTEAD.get((do, key), {})
     good, bad = BOUNDS[do][key]
     for value in good:
         step.model_validate({"do": do, **least, key: value})
@@ -403,7 +459,9 @@ def test_the_facts_of_a_step_are_those_of_its_actions(do: str, scene: Any) -> No
     assert max(level for one in actions for level in one.voltage) <= max(actions[0].by.highest_voltage, 100.0)
     asks = {"prompt", "mount", "weigh", "jog"}  # whoever is asked to do something there touches the rig
     assert step.hands is (do in asks)
-    assert step.needs_contact is (do in {"precondition", "ramp", "voltage", "sweep", "relax", "breakdown", "follow"})
+    assert step.needs_contact is (
+        do in {"precondition", "ramp", "voltage", "sweep", "relax", "breakdown", "cycle", "follow"}
+    )
     assert step.finds_contact is (do == "approach")
 
 
