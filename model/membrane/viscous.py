@@ -293,7 +293,7 @@ def balance(
 def _definite(matrix: Array) -> NDArray[np.bool_]:
     """Which of the matrices (S, n, n) are positive definite."""
     if not np.isfinite(matrix).all():
-        whole = np.isfinite(matrix.sum(axis=(1, 2)))
+        whole: NDArray[np.bool_] = np.isfinite(matrix.sum(axis=(1, 2)))
         whole[whole] = _definite(matrix[whole])
         return whole
     try:
