@@ -101,6 +101,7 @@ def fetch() -> None:
     """Bring the ``ziglang`` wheel into the cache of uv, or of pip."""
     # With PYTHONPATH pip hides the packages outside its build environment from us, pip itself among them.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment.setdefault("UV_HTTP_RETRIES", "1")  # without a network nobody has to wait for it
     uv = os.environ.get("UV") or shutil.which("uv")
     with tempfile.TemporaryDirectory() as scratch:
         if uv:
@@ -114,7 +115,7 @@ def compile_kernel(directory: Path, library: ModuleType) -> tuple[Path, str]:
     """Compile every ``*.c`` in ``directory`` to the library there; ``library`` is ``library.py`` as a module.
 
     Returns its path and what compiled it. The file appears at once and whole, so that two builds do each other no harm.
-    Raises `Failed`; a library of before is then gone, and why stands beside it.
+    Raises `Failed`; a library of other sources is then gone, and why stands in its place.
     """
     path, reason = library.library_path(directory), library.reason_path(directory)
     try:
@@ -126,7 +127,9 @@ def compile_kernel(directory: Path, library: ModuleType) -> tuple[Path, str]:
             made.unlink(missing_ok=True)
             raise Failed(f"{path.name} cannot be replaced, a program may be using it: {error.strerror}") from None
     except (Failed, OSError) as failed:
-        _write(reason, str(failed))
+        if library.opened(directory)[0] is None:  # one of these very sources may stay
+            path.unlink(missing_ok=True)
+            _write(reason, str(failed))
         raise Failed(str(failed)) from None
     reason.unlink(missing_ok=True)
     return path, compiler
@@ -137,7 +140,7 @@ def _compiler() -> tuple[list[str], str]:
     if command is not None:
         return command, "cc"
     if importlib.util.find_spec("ziglang") is None:
-        raise Failed(f"{missing}, and the {ZIGLANG} wheel could not be had; install a C compiler")
+        raise Failed(f"{missing}, and the {ZIGLANG} wheel could not be had")
     return [sys.executable, "-m", "ziglang", "cc"], "ziglang"
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 VERSION = 1  # of the functions and what they take; DEA_KERNEL_VERSION in version.h
 HERE = Path(__file__).resolve().parent
-REBUILD = "uv sync --reinstall-package dea-rig builds it"
+REBUILD = "install dea-rig anew (uv sync --reinstall-package dea-rig)"
 
 
 def library_path(directory: Path = HERE) -> Path:
@@ -59,7 +59,7 @@ def opened(directory: Path) -> tuple[ctypes.CDLL | None, str]:
     path = library_path(directory)
     if not path.exists():
         try:
-            return None, reason_path(directory).read_text(encoding="utf-8").strip()
+            return None, f"{reason_path(directory).read_text(encoding='utf-8').strip()}; {REBUILD}"
         except OSError:
             return None, f"it has not been built; {REBUILD}"
     try:

@@ -1,0 +1,197 @@
+"""The kernel's build and its loader: which compiler is taken, what is refused, and that nothing of it stops the job."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+
+from model.kernel import build, library
+
+HERE = Path(library.__file__).parent
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="the stand-in compilers are shell scripts")
+GOOD = """#!/bin/sh
+# A stand-in for a C compiler: hands out a library that was made before, and notes how it was called.
+echo "$@" >> "$0.calls"
+while [ "$1" != -o ]; do shift; done
+[ -f "$0.so" ] && cp "$0.so" "$2" || echo made > "$2"
+"""
+BAD = "#!/bin/sh\necho 'some.c: note: in what follows' >&2\necho 'some.c:1: error: no math.h here' >&2\nexit 1\n"
+
+
+@pytest.fixture
+def bin_(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A PATH that holds what sh needs, and no compiler; no network."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for name in ("sh", "cp", "echo"):
+        found = shutil.which(name)
+        assert found is not None
+        (folder / name).symlink_to(found)
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.delenv("UV", raising=False)
+    return folder
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> Path:
+    """A copy of the kernel's folder, without what was built there."""
+    folder = tmp_path / "kernel"
+    folder.mkdir()
+    for path in HERE.iterdir():
+        if path.suffix in {".c", ".h", ".py"}:
+            shutil.copy(path, folder)
+    return folder
+
+
+def put(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+def calls(compiler: Path) -> list[str]:
+    return compiler.with_name(f"{compiler.name}.calls").read_text(encoding="utf-8").splitlines()
+
+
+def built(sources: Path) -> list[str]:
+    return sorted(path.name for path in sources.iterdir() if path.suffix not in {".c", ".h", ".py"})
+
+
+@POSIX
+def test_digits_do_not_depend_on_the_machine(bin_: Path, sources: Path) -> None:
+    compiler = put(bin_ / "cc", GOOD)
+    assert build.compile_kernel(sources, library) == (library.library_path(sources), "cc")
+    told = calls(compiler)[-1].split()
+    assert {"-O3", "-std=c99", "-ffp-contract=off", "-fno-math-errno", "-shared", "-lm"} <= set(told)
+    assert not {"-ffast-math", "-Ofast", "-march=native"} & set(told)
+    assert f"-DDEA_KERNEL_SOURCES={library.sources_digest(sources)}" in told
+    assert {path.name for path in sources.glob("*.c")} == {Path(word).name for word in told if word.endswith(".c")}
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "compiler", "wanted", "not_wanted"),
+    [
+        ("linux", "x86_64", "cc", {"-march=x86-64-v2", "-fPIC"}, {"-arch", "-target"}),
+        ("linux", "x86_64", "ziglang", {"-march=x86_64_v2", "-target", "x86_64-linux-gnu"}, {"-march=x86-64-v2"}),
+        ("linux", "aarch64", "ziglang", {"-fPIC", "aarch64-linux-gnu"}, {"-march=x86_64_v2"}),
+        ("darwin", "arm64", "cc", {"-arch", "arm64", "-fPIC"}, {"-target", "-march=x86-64-v2"}),
+        ("darwin", "arm64", "ziglang", {"-target", "aarch64-macos"}, {"-arch"}),
+        ("win32", "AMD64", "ziglang", {"-march=x86_64_v2", "x86_64-windows-gnu"}, {"-fPIC", "-arch"}),
+    ],
+)
+def test_flags_of_other_systems(
+    system: str, machine: str, compiler: str, wanted: set[str], not_wanted: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(build.platform, "machine", lambda: machine)
+    monkeypatch.setattr(build.platform, "libc_ver", lambda: ("glibc", "2.36"))
+    flags = set(build.flags(compiler))
+    assert wanted <= flags and not not_wanted & flags
+
+
+@POSIX
+def test_cc_is_honoured_with_its_arguments(bin_: Path, sources: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(bin_ / "cc", BAD)
+    compiler = put(bin_ / "my-cc", GOOD)
+    monkeypatch.setenv("CC", "my-cc -pipe")
+    build.compile_kernel(sources, library)
+    assert calls(compiler)[-1].startswith("-pipe ")
+    assert build.requirements() == []
+
+
+@POSIX
+def test_a_compiler_that_cannot_compile_is_passed_over(bin_: Path, sources: Path) -> None:
+    put(bin_ / "cc", BAD)
+    compiler = put(bin_ / "clang", GOOD)
+    build.compile_kernel(sources, library)
+    assert len(calls(compiler)) == 2  # the trial, and the kernel
+
+
+@POSIX
+def test_without_any_compiler_the_reason_stands_beside_the_package(bin_: Path, sources: Path) -> None:
+    put(bin_ / "cc", BAD)
+    library.library_path(sources).write_bytes(b"of another day")
+    with pytest.raises(build.Failed, match=r"cc does not work \(some.c:1: error: no math.h here\), gcc is not there"):
+        build.compile_kernel(sources, library)
+    found, why = library.opened(sources)
+    assert found is None and "gcc is not there" in why and "ziglang" in why and "\n" not in why
+    assert built(sources) == [library.reason_path(sources).name]
+    put(bin_ / "cc", GOOD)
+    build.compile_kernel(sources, library)
+    assert built(sources) == [library.library_path(sources).name]
+
+
+@POSIX
+def test_ziglang_is_required_only_where_it_is_needed_and_can_be_had(bin_: Path) -> None:
+    put(bin_ / "uv", BAD)
+    assert build.requirements() == []  # no compiler, no network: the installation must go on
+    fetcher = put(bin_ / "uv", '#!/bin/sh\necho "$@" >> "$0.calls"\n')
+    assert build.requirements() == [build.ZIGLANG]
+    assert build.ZIGLANG in calls(fetcher)[0].split()  # it is in the cache before anybody is asked to have it
+    put(bin_ / "gcc", GOOD)
+    assert build.requirements() == []
+
+
+@POSIX
+def test_a_failed_compilation_leaves_no_part_of_a_library(bin_: Path, sources: Path) -> None:
+    put(bin_ / "cc", f"{GOOD}case $(basename $2) in trial.so) ;; *) exit 1 ;; esac\n")
+    (bin_ / "basename").symlink_to(shutil.which("basename", path="/usr/bin:/bin") or "/usr/bin/basename")
+    with pytest.raises(build.Failed):
+        build.compile_kernel(sources, library)
+    assert built(sources) == [library.reason_path(sources).name]
+
+
+def test_what_is_no_library_is_refused(sources: Path) -> None:
+    assert library.opened(sources)[0] is None
+    assert "has not been built" in library.opened(sources)[1]
+    library.library_path(sources).write_bytes(b"not a library")
+    found, why = library.opened(sources)
+    assert found is None and "does not load" in why and "\n" not in why
+
+
+@pytest.mark.slow
+def test_a_real_build_loads_and_a_stale_one_is_refused(sources: Path) -> None:
+    if build.system_compiler()[0] is None:
+        pytest.skip("no C compiler on this machine")
+    path, compiler = build.compile_kernel(sources, library)
+    found, says = library.opened(sources)
+    assert isinstance(found, ctypes.CDLL) and found.dea_kernel_version() == library.VERSION
+    assert says == f"compiled kernel {library.sources_digest(sources)}, {compiler}"
+    (sources / "added.h").write_text("/* changed since */\n", encoding="utf-8")
+    found, says = library.opened(sources)
+    assert found is None and "other sources" in says
+    assert built(sources) == [path.name]
+
+
+@pytest.mark.slow
+def test_a_library_of_another_interface_is_refused(sources: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if build.system_compiler()[0] is None:
+        pytest.skip("no C compiler on this machine")
+    build.compile_kernel(sources, library)
+    monkeypatch.setattr(library, "VERSION", library.VERSION + 1)
+    found, says = library.opened(sources)
+    assert found is None and "interface" in says
+
+
+@pytest.mark.slow
+def test_a_failed_build_leaves_a_good_library(sources: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if build.system_compiler()[0] is None:
+        pytest.skip("no C compiler on this machine")
+    build.compile_kernel(sources, library)
+    monkeypatch.setenv("CC", str(put(tmp_path / "cc", BAD)))
+    with pytest.raises(build.Failed):
+        build.compile_kernel(sources, library)
+    assert library.opened(sources)[0] is not None
+
+
+def test_this_installation_has_its_kernel() -> None:
+    """Where there is a compiler, a change of the sources is followed by a build: cache-keys in pyproject.toml."""
+    if build.system_compiler()[0] is None:
+        pytest.skip("no C compiler on this machine")
+    assert library.load() is not None, library.says()
