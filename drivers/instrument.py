@@ -12,9 +12,16 @@ from drivers.recorded import Dialect
 from drivers.roles import Device
 from drivers.settings import CanSettings, InstrumentSettings
 
-Role = Literal["stage", "force", "displacement", "hv"]
-ROLES: tuple[Role, ...] = ("stage", "force", "displacement", "hv")
+Role = Literal["stage", "force", "displacement", "hv", "monitor"]
+ROLES: tuple[Role, ...] = ("stage", "force", "displacement", "hv", "monitor")
 """In the order in which the instruments of a rig are polled."""
+MONITORS = ("monitor", "monitor_2", "monitor_3")
+"""A rig may have so many of these; all other roles are there once, under their own name."""
+
+
+def role_of(name: str) -> str:
+    """The role of the instrument that a scene calls so."""
+    return "monitor" if name in MONITORS else name
 
 
 @dataclass(frozen=True)

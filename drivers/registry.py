@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 import drivers.instruments
-from drivers.instrument import Instrument
+from drivers.instrument import Instrument, role_of
 
 GROUP = "dea_rig.instruments"
 
@@ -50,7 +50,7 @@ def registered() -> Registered:
 
 
 def instrument(role: str, driver: str) -> Instrument:
-    """The instrument of that name.
+    """The instrument of that name; ``role`` may be a scene's name for it.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def instrument(role: str, driver: str) -> Instrument:
         Saying which there are for this role, and which packages could not be imported.
     """
     try:
-        return registered().instruments[role, driver]
+        return registered().instruments[role_of(role), driver]
     except KeyError:
         known = ", ".join(of_role(role)) or "none"
         broken = "".join(f" {text}" for text in registered().broken)
@@ -66,8 +66,8 @@ def instrument(role: str, driver: str) -> Instrument:
 
 
 def of_role(role: str) -> dict[str, Instrument]:
-    """The instruments of a role, by driver name."""
-    return {one.driver: one for one in registered().instruments.values() if one.role == role}
+    """The instruments of a role, by driver name; ``role`` may be a scene's name for it."""
+    return {one.driver: one for one in registered().instruments.values() if one.role == role_of(role)}
 
 
 def _add(found: Registered, instruments: tuple[Instrument, ...]) -> None:

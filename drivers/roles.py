@@ -1,4 +1,4 @@
-"""What a stage, a force sensor, a displacement sensor and an HV supply can do, and the samples they give.
+"""What a stage, a force sensor, a displacement sensor, an HV supply and a monitor can do, and the samples they give.
 
 A driver is polled: ``poll(now)`` reads what has arrived, sends what is due, and returns the new samples. It never
 blocks and never asks the time itself. After construction a driver first runs its set-up dialogue; ``ready`` is True
@@ -14,6 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Flag, auto
 from typing import Protocol, runtime_checkable
+
+from drivers.settings import Quantity
 
 
 class SampleFlag(Flag):
@@ -87,7 +89,21 @@ class HVSample:
     flags: HVFlag
 
 
-Sample = StageSample | ForceSample | DisplacementSample | HVSample
+@dataclass(frozen=True, slots=True)
+class MonitorSample:
+    """A slow reading beside those of the rig: volts, kelvin, or part of saturation (0 to 1), as ``quantity`` says.
+
+    ``role`` is the name of the instrument that gave it; the value is NaN when there is none.
+    """
+
+    t: float
+    role: str
+    quantity: Quantity
+    value: float
+    flags: SampleFlag = OK
+
+
+Sample = StageSample | ForceSample | DisplacementSample | HVSample | MonitorSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +215,15 @@ class ForceSensor(Device, Protocol):
 
 class DisplacementSensor(Device, Protocol):
     """A displacement sensor polled or streaming at ``rate`` hertz."""
+
+    @property
+    def rate(self) -> float: ...
+
+
+class Monitor(Device, Protocol):
+    """A reading beside those of the rig, ``rate`` times a second: of ``quantity``."""
+
+    quantity: Quantity
 
     @property
     def rate(self) -> float: ...

@@ -217,3 +217,77 @@ class SupplySettings(InstrumentSettings):
     parallel_capacitance_nF: NotNegative = Field(
         default=0.0, description="Capacitance of cable and output beside the film (nF), charged as well."
     )
+
+
+Quantity = Literal["voltage", "temperature", "humidity"]
+MonitorUnit = Literal["V", "kV", "mV", "C", "K", "%"]
+MONITOR_UNITS: dict[str, tuple[Quantity, float, float]] = {
+    "V": ("voltage", 1.0, 0.0),
+    "kV": ("voltage", 1e3, 0.0),
+    "mV": ("voltage", 1e-3, 0.0),
+    "C": ("temperature", 1.0, 273.15),
+    "K": ("temperature", 1.0, 0.0),
+    "%": ("humidity", 0.01, 0.0),
+}
+"""Of each unit: what it measures, its size in V, K or 1, and what 0 of it is there. The usual unit comes first."""
+SLOWEST_VOLTAGE_HZ = 1.0
+
+
+class MonitorSettings(InstrumentSettings):
+    """What every instrument has that gives a slow reading beside those of the rig."""
+
+    rate_key: ClassVar[str] = "rate_Hz"
+
+    quantity: Quantity = Field(
+        description='What it reads: "voltage" of the output, a second reading that must agree with the supply; off is '
+        'only what both show. Or "temperature" or "humidity" of the air at the film, for log and report.'
+    )
+    unit: MonitorUnit | None = Field(
+        default=None,
+        description="What the number that it gives is in, once multiplied by factor. Absent: V, C or %, by quantity.",
+    )
+    factor: float = Field(
+        default=1.0,
+        description="What the number is multiplied by to give the unit; 1000 of a 1000:1 probe on a voltmeter "
+        "(V per V). Not 0.",
+    )
+    offset: float = Field(default=0.0, description="What is added after that, in the unit. Typical: 0.")
+    rate_Hz: float = Field(
+        default=5.0,
+        ge=0.05,
+        le=100,
+        description="How often it gives a value (Hz); of a voltage at least 1. Typical: 5.",
+    )
+    agrees_within_V: Positive = Field(
+        default=50.0, description="How far a voltage may be from the supply's own reading (V). Typical: 20 to 100."
+    )
+    agrees_within_percent: NotNegative = Field(
+        default=5.0,
+        le=50,
+        description="The same as a part of the voltage (%); the larger of the two holds. Typical: 3.",
+    )
+    lag_s: float = Field(
+        default=0.5,
+        ge=0,
+        le=5,
+        description="How much later than the supply it may show a change (s): its filter and its integration time. "
+        "Typical: 0.1 to 1.",
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.factor == 0.0:
+            raise ValueError("factor must not be 0")
+        if self.unit is not None and MONITOR_UNITS[self.unit][0] != self.quantity:
+            units = ", ".join(unit for unit, (quantity, _, _) in MONITOR_UNITS.items() if quantity == self.quantity)
+            raise ValueError(f"unit = {self.unit!r} is none of a {self.quantity}; those are {units}")
+        if self.quantity == "voltage" and self.sample_rate < SLOWEST_VOLTAGE_HZ:
+            raise ValueError(f"{self.rate_key} must be at least {SLOWEST_VOLTAGE_HZ:g} Hz for a voltage")
+        return self
+
+    @property
+    def to_si(self) -> tuple[float, float]:
+        """(factor, offset) that make V, K or 1 of the number that the instrument gives."""
+        usual = next(unit for unit, (quantity, _, _) in MONITOR_UNITS.items() if quantity == self.quantity)
+        _, size, zero = MONITOR_UNITS[self.unit or usual]
+        return self.factor * size, self.offset * size + zero

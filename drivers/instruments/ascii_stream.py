@@ -1,4 +1,4 @@
-r"""A sensor that sends lines of text by itself: an Arduino with an HX711, many USB load cells and dial gauges.
+r"""A sensor that sends lines of text by itself: an Arduino with an HX711, many USB load cells, dial gauges and meters.
 
 There is no protocol beyond this: every line ends with LF, or CR LF, and has ``columns`` columns; one of them is the
 value as a decimal number, ``-0.01234\r\n`` say. Nothing is ever sent to it. All that a scene says of it has to be
@@ -28,8 +28,8 @@ from drivers.instrument import Instrument
 from drivers.lines import LineSplitter
 from drivers.links.link import ByteLink, DeviceRefused, DeviceSilent
 from drivers.recorded import Dialect
-from drivers.roles import OK, DisplacementSample, ForceSample, Identity, SampleFlag
-from drivers.settings import ForceSettings, Positive, SerialSettings
+from drivers.roles import OK, DisplacementSample, ForceSample, Identity, MonitorSample, SampleFlag
+from drivers.settings import MONITOR_UNITS, ForceSettings, MonitorSettings, Positive, Quantity, SerialSettings
 
 POLL_S = 4e-3
 """Longest time between two polls."""
@@ -107,6 +107,17 @@ class AsciiDisplacementSettings(AsciiSettings):
     unit: LengthUnit = Field(default="mm", description="What the number is in, once multiplied by factor.")
 
 
+class AsciiMonitorSettings(AsciiSettings, MonitorSettings):
+    """A meter, thermometer or hygrometer that sends lines with numbers by itself."""
+
+    rate_Hz: float = Field(
+        default=5.0,
+        ge=0.05,
+        le=100,
+        description="How many lines it sends per second (Hz); of a voltage at least 1. Typical: 1 to 10.",
+    )
+
+
 # -- codec: bytes to values --------------------------------------------------------------------------------------------
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]{1,15}(?:\.[0-9]{0,15})?|\.[0-9]{1,15})(?:[eE][+-]?[0-9]{1,2})?")
@@ -174,7 +185,7 @@ class Codec:
 
 # -- device ------------------------------------------------------------------------------------------------------------
 
-S = TypeVar("S", ForceSample, DisplacementSample)
+S = TypeVar("S", ForceSample, DisplacementSample, MonitorSample)
 
 
 class AsciiStream(Generic[S]):
@@ -334,7 +345,53 @@ class AsciiDisplacement(AsciiStream[DisplacementSample]):
         return DisplacementSample(t, value, flags)
 
 
+class AsciiMonitor(AsciiStream[MonitorSample]):
+    """A `drivers.roles.Monitor`."""
+
+    units: ClassVar[Mapping[str, float]] = {unit: size for unit, (_, size, _) in MONITOR_UNITS.items()}
+
+    def __init__(
+        self,
+        name: str,
+        link: ByteLink,
+        *,
+        quantity: Quantity = "voltage",
+        to_si: tuple[float, float] = (1.0, 0.0),
+        unit: str = "",
+        factor: float = 1.0,
+        limit: float = 1e4,
+        separator: Separator = ",",
+        columns: int = 1,
+        column: int = 1,
+        rate_Hz: float = 5.0,
+        boot_s: float = 3.0,
+        timeout_s: float = 0.25,
+    ) -> None:
+        self.quantity = quantity
+        self._zero = to_si[1]
+        super().__init__(
+            name,
+            link,
+            unit=unit or next(unit for unit, (of, _, _) in MONITOR_UNITS.items() if of == quantity),
+            factor=factor,
+            limit=limit,
+            separator=separator,
+            columns=columns,
+            column=column,
+            rate_Hz=rate_Hz,
+            boot_s=boot_s,
+            timeout_s=timeout_s,
+        )
+
+    def _scale_in_words(self) -> dict[str, str]:
+        return {"si_per_number": f"{self._scale:.9g}", "si_at_zero": f"{self._zero:.9g}"}
+
+    def _sample(self, t: float, value: float, flags: SampleFlag) -> MonitorSample:
+        return MonitorSample(t, self.name, self.quantity, value + self._zero, flags)
+
+
 INSTRUMENTS = (
     Instrument("ascii-stream", "force", AsciiForceSettings, AsciiForce, Dialect(b"\n")),
+    Instrument("ascii-stream", "monitor", AsciiMonitorSettings, AsciiMonitor, Dialect(b"\n")),
     Instrument("ascii-stream", "displacement", AsciiDisplacementSettings, AsciiDisplacement, Dialect(b"\n")),
 )

@@ -1,9 +1,9 @@
-"""Which pseudo-terminals lead to a simulated bench, provably: said by the process that serves it, while it does.
+"""Which ports lead to a simulated bench, provably: said by the process that serves it, while it does.
 
 The server keeps a file in this user's own directory, which nobody else can write: its process number, when that process
-began, and the terminals that it serves. It counts only while that very process lives and, where the system tells
-(Linux), has the other ends of these terminals open. A list of ports that was printed once proves nothing later: the
-system gives the same names to others.
+began, and the terminals and TCP ports of this machine that it serves. It counts only while that very process lives and,
+where the system tells (Linux), has the other ends of these terminals open and listens on these ports. A list of ports
+that was printed once proves nothing later: the system gives the same names to others.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from pathlib import Path
 from drivers.links.port_lock import remove_if_empty, user_directory
 
 LARGEST = 4096  # bytes of such a file
+LOOPBACK = "127.0.0.1"
+_TCP = f"tcp:{LOOPBACK}:"
+_LISTENING = "0A"  # in /proc/net/tcp
 _numbers = itertools.count()
 
 
@@ -33,7 +36,7 @@ class Announcement:
         content = {
             "pid": os.getpid(),
             "began": _began(os.getpid()),
-            "ports": [os.path.realpath(port) for port in ports],
+            "ports": [_name(port) for port in ports],
         }
         with suppress(OSError):
             path = self._path or user_directory() / f"served-{os.getpid()}-{next(_numbers)}.json"
@@ -53,7 +56,7 @@ class Announcement:
 
 def are_served(ports: Iterable[str]) -> bool:
     """Whether each of these ports, behind whatever name, is served by a simulated bench at this moment."""
-    wanted = {os.path.realpath(port) for port in ports}
+    wanted = {_name(port) for port in ports}
     try:
         files = sorted(user_directory().glob("served-*.json"))
     except OSError:
@@ -73,8 +76,36 @@ def _is_true(pid: int, began: str, ports: set[str]) -> bool:
         return False
     if _began(pid) != began:
         return False
-    held = _terminals_of(pid)
-    return held is None or ports <= held
+    terminals, numbers = _terminals_of(pid), _listening(pid)
+    known = {port for port in ports if (numbers if port.startswith(_TCP) else terminals) is None}
+    return ports <= known | (terminals or set()) | (numbers or set())
+
+
+def tcp_port(number: int) -> str:
+    """How a TCP port of this machine is called here."""
+    return f"{_TCP}{number}"
+
+
+def _name(port: str) -> str:
+    return port if port.startswith(_TCP) else os.path.realpath(port)
+
+
+def _listening(pid: int) -> set[str] | None:
+    """The TCP ports of the loopback on which the process listens; None where the system does not say."""
+    try:
+        lines = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    except OSError:
+        return None
+    sockets = set()
+    with suppress(OSError):
+        for one in Path(f"/proc/{pid}/fd").iterdir():
+            with suppress(OSError):  # it was closed meanwhile
+                sockets.add(str(one.readlink()))
+    return {
+        tcp_port(int(line[1].partition(":")[2], 16))
+        for line in lines
+        if line[3] == _LISTENING and line[1].startswith("0100007F:") and f"socket:[{line[9]}]" in sockets
+    }
 
 
 def _began(pid: int) -> str:

@@ -66,14 +66,15 @@ clearance_mm = 0.5
 """
 
 
-def scene_text() -> str:
-    """The scene of the runs."""
+def scene_text(more: str = "") -> str:
+    """The scene of the runs; ``more`` are further tables."""
     fixtures = Path(str(files("sim_fixtures")))
     text = (fixtures / "scenes" / "cone-4mm.toml").read_text(encoding="utf-8")
     for old, new in CHANGES.items():
         if old not in text:
             raise ValueError(f"the example scene has no {old!r} any more")
         text = text.replace(old, new)
+    text = text.replace("[simulation]\n", f"{more}\n[simulation]\n", 1)
     return text.replace("../calibrations", (fixtures / "calibrations").as_posix())
 
 
@@ -108,15 +109,17 @@ class Stand:
         For scene, protocol and logs.
     hold_s : float
         How long a run holds voltage and displacement.
+    more : str
+        Further tables of the scene.
     """
 
-    def __init__(self, folder: Path, hold_s: float = 1.0) -> None:
+    def __init__(self, folder: Path, hold_s: float = 1.0, more: str = "") -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self.words = folder / "words.txt"  # what guards say
         self.words.touch()
         self.scene, self.protocol = folder / "scene.toml", folder / "protocol.toml"
-        self.scene.write_text(scene_text(), encoding="utf-8")
+        self.scene.write_text(scene_text(more), encoding="utf-8")
         self.protocol.write_text(PROTOCOL.replace("HOLD_S", f"{hold_s:g}"), encoding="utf-8")
         loaded, _ = load_scene(self.scene)
         self.bench = ServedBench(simulated_bench(loaded))
@@ -144,10 +147,13 @@ class Stand:
         self.wait(lambda: run.engine > 0, "an engine")
         return run
 
-    def ports(self) -> dict[str, dict[str, str]]:
+    def ports(self) -> dict[str, dict[str, Any]]:
         """Ports by role, under names that stay the same when a port comes back as another pseudo-terminal."""
-        named: dict[str, dict[str, str]] = {}
+        named: dict[str, dict[str, Any]] = {}
         for role, keys in self.bench.ports.items():
+            if "host" in keys:
+                named[role] = dict(keys)
+                continue
             key = "can_channel" if "can_channel" in keys else "port"
             name = self.folder / f"tty-{role}"
             if name.is_symlink() and str(name.readlink()) != str(keys[key]):

@@ -19,7 +19,8 @@ from rig.operator.status import Status
 from rig.protocol.experiment import Experiment, prepare
 from rig.run.run import Consent
 from rig.run.run import run as run_experiment
-from rig.safety.arming import UNDETECTABLE
+from rig.safety.arming import undetectable
+from rig.scene.scene import Scene
 
 
 def prepare_step(scene: Path, title: str, step: Mapping[str, Any], ports: dict[str, Any] | None) -> Experiment:
@@ -61,7 +62,7 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
     try:
         with Display(f"{word}: {kind}. {scene.specimen.name}: {experiment.protocol.title}", word) as display:
             if arm and highest > 0 and scene.on_real_ports:
-                display.say(UNDETECTABLE)
+                display.say(undetectable(_second(scene)))
             outcome = run_experiment(experiment, out, lambda done, total, label: None, consent, display.say, show=show)
     except (RigError, DeviceError) as error:
         if not begun and scene.on_real_ports and isinstance(error, FaultError | DeviceError):
@@ -72,6 +73,12 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
     said = f"{word}: {out}: {outcome.reason} after {outcome.duration:.0f} s; {outcome.state}."
     tell(said, "stdout")
     _tell_elsewhere(experiment, out, 0, said)
+
+
+def _second(scene: Scene) -> str:
+    """The second reading of the voltage, in words; empty: there is none."""
+    role = scene.second_reading
+    return f"{role}: {scene.monitors[role].driver}" if role else ""
 
 
 def _tell_elsewhere(experiment: Experiment, out: Path, exit_code: int, text: str) -> None:

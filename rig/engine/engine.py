@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from drivers.links.link import DeviceError, DeviceSilent
-from drivers.roles import HVSample, Sample
+from drivers.roles import HVSample, MonitorSample, Sample
 from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.base.host import HostTime
 from rig.bench.bench import Bench
@@ -32,8 +32,9 @@ from rig.operator.control import Control
 from rig.operator.status import Status
 from rig.safety import heartbeat
 from rig.safety.arming import Arming
-from rig.safety.guard import GIVE_BACK, SAFE_VOLTAGE, AnyGuard, Guard, GuardState
+from rig.safety.guard import AT_ONCE_S, GIVE_BACK, AnyGuard, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limit, Limits
+from rig.safety.second import SecondReading
 from rig.steps.base import Action, Result, Turns, write_phase
 from rig.steps.output import choose_about_live_output, confirm_voltage
 from rig.steps.regain import regain_duration
@@ -123,6 +124,8 @@ class Engine:
         self._beats = 0
         self._next_beat = -math.inf
         self._watch: Watch | None = None
+        self._air = set(bench.scene.monitors) - {bench.scene.second_reading}
+        self._told_of_air: set[str] = set()
         self._started = self.clock.now()
         self._next_progress = 0.0
         self._number = 0  # of the action that is being carried out
@@ -211,12 +214,13 @@ class Engine:
         allowed = allowed_silence(self.bench)
         fresh = {role: allowed[role] + heartbeat.MARGIN_S for role in heartbeat.ROLES if role in allowed}
         if process is not None:
-            process.appoint(self.gains.voltage, fresh, tell, event)
+            process.appoint(self.gains.voltage, self.gains.second, fresh, tell, event)
             self.rig.guard = process
         else:
             assert self.bench.hv is not None
             film = FilmLimits(scene.specimen.specimen(), self.limits)
-            self.rig.guard = Guard(self.bench.hv, self.limits, film, scene.hv.ramp_V_per_s, tell, fresh)
+            second = SecondReading.of(scene, self.limits.measured_voltage.high)
+            self.rig.guard = Guard(self.bench.hv, self.limits, film, scene.hv.ramp_V_per_s, tell, fresh, second)
         if not scene.hv.measures_current:
             self.recorder.event("warning", "hv", "this supply does not measure its current: nothing watches it")
 
@@ -304,7 +308,7 @@ class Engine:
         guard = self.guard
         if guard is None:
             return
-        end = self.clock.now() + OUTPUT_LIMIT_S
+        end = self.clock.now() + OUTPUT_LIMIT_S + guard.off_limit - AT_ONCE_S
         while not guard.output_is_safe and self.clock.now() < end:
             self._turn()
         self._take_turns(choose_about_live_output(self.rig))
@@ -370,8 +374,7 @@ class Engine:
         guard = self.guard
         if guard is None or not action.by.hands or self.control.question is None:
             return
-        off = guard.last is not None and abs(guard.last.voltage) < SAFE_VOLTAGE
-        if not (guard.state is GuardState.SAFE and off):
+        if not (guard.state is GuardState.SAFE and guard.output_is_safe):
             raise FaultError(
                 f"Step {action.step} ({action.kind}) asks for the operator's hands though the high voltage is not "
                 "latched and measured off: its carry_out must take it down first."
@@ -436,7 +439,7 @@ class Engine:
         for role in self.bench.devices:
             # Each device its own time: data must never seem to have come before they were sent.
             now = self.clock.now()
-            for sample in self.bench.poll(role, now):
+            for sample in self._poll(role, now):
                 self._take(role, sample, now)
             for remark in self.bench.remarks(role):
                 self._remark(role, remark)
@@ -449,6 +452,18 @@ class Engine:
             self._beat(self._watch, now)
         self.recorder.tick(now)
         self.clock.sleep_until(self._next_turn(began))
+
+    def _poll(self, role: str, now: float) -> Sequence[Sample]:
+        """New samples. An instrument that only says what air it is ends no run, once it has begun."""
+        try:
+            return self.bench.poll(role, now)
+        except DeviceError as error:
+            if self._watch is None or role not in self._air:
+                raise
+            if str(error) not in self._told_of_air:
+                self._told_of_air.add(str(error))
+                self._remark(role, f"{str(error).rstrip('.')}; the run goes on without")
+            return ()
 
     def _beat(self, watch: Watch, now: float) -> None:
         """Tell the guard that this loop turns, and on how fresh data. Nothing else ever does."""
@@ -472,6 +487,8 @@ class Engine:
             self.rig.listener(sample)
         if isinstance(sample, HVSample) and self.guard is not None:
             self.guard.on_sample(sample)
+        elif isinstance(sample, MonitorSample) and self.guard is not None:
+            self.guard.on_monitor(sample)
         if self._watch is not None:
             self._watch.sample(role, sample, now)
 
@@ -486,4 +503,5 @@ class Engine:
             force=recorder.force,
             position=recorder.stage.position if recorder.stage is not None else math.nan,
             duration=self.clock.now() - self._started,
+            second=self.guard.second_words if self.guard is not None else "",
         )

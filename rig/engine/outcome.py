@@ -14,7 +14,8 @@ class Outcome:
 
     ``status`` is one of complete, stopped, limit, fault; or NOT SAFE, which is worse than all of them, whenever
     ``safe`` is False. ``reason`` says what ended the run in any case. ``safe`` is True only when the output was
-    *measured* below 60 V twice, or when the scene has no HV; ``standing`` only when the stage said that it stands.
+    *measured* below 60 V twice, by the supply and by the second reading where there is one, or when the scene has no
+    HV; ``standing`` only when the stage said that it stands. ``second``: what the second reading shows, in words.
     """
 
     status: str
@@ -25,6 +26,7 @@ class Outcome:
     force: float
     position: float
     duration: float
+    second: str = ""
 
     @property
     def state(self) -> str:
@@ -36,7 +38,7 @@ class Outcome:
             output = (
                 f"high voltage {'off, measured' if self.safe else 'NOT SAFE, last measured'} {round(self.voltage)} V"
             )
-        return f"{stage}; {output}"
+        return f"{stage}; {output}{f'; {self.second}' if self.second else ''}"
 
     def as_text(self) -> dict[str, str]:
         """As the log's metadata: text only, units in the names."""
@@ -49,4 +51,5 @@ class Outcome:
             "measured_force_N": f"{self.force:.5f}",
             "stage_position_mm": f"{self.position * 1e3:.4f}",
             "duration_s": f"{self.duration:.3f}",
+            **({"second_reading": self.second} if self.second else {}),
         }

@@ -12,11 +12,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
-from drivers.roles import HVSample
+from drivers.roles import HVSample, MonitorSample
 from rig.bench.bench import Bench
 from rig.log.recorder import Recorder
 from rig.operator.control import Control
-from rig.safety.guard import ADVICE, AT_ONCE_S, NOT_SAFE, AnyGuard, ramp_limit
+from rig.safety.guard import ADVICE, AT_ONCE_S, NOT_SAFE, AnyGuard
 
 SHORTEST_S = 0.001  # of a turn
 AGAIN_S = 0.1  # a command that failed is given again at this interval
@@ -58,7 +58,11 @@ class Teardown:
         self._recorder.best_effort = True
         commanded = guard is not None and guard.commanded
         hastened = not orderly
-        end = clock.now() + (AT_ONCE_S if hastened else self._ramp_limit()) if commanded else clock.now() + LISTEN_S
+        at_once = AT_ONCE_S if guard is None else guard.off_limit
+        limit = at_once - AT_ONCE_S + LISTEN_S
+        if guard is not None and commanded:
+            limit = at_once if hastened else guard.ramp_limit
+        end = clock.now() + limit
         self._stop_stage()  # first: it waits for nobody, and a guard that hangs would keep it moving
         if "stage" in self._bench.devices:
             self._attempt("stage", partial(self._poll, "stage"))
@@ -68,7 +72,7 @@ class Teardown:
             self._control.poll(now)
             late = now >= end and not self._safe()
             if commanded and not hastened and (self._control.count >= 2 or "hv" in self._failed or late):
-                hastened, end = True, now + AT_ONCE_S
+                hastened, end = True, now + at_once
                 self._off(f"{cause}; hastened", at_once=True)
             for role in sorted(self._bench.devices, key=lambda role: role != "hv"):
                 answers = self._attempt(role, partial(self._poll, role), heals=not (role == "hv" and commanded))
@@ -87,12 +91,9 @@ class Teardown:
             clock.sleep_until(self._due(next_turn, now))
         rest = Rest(self._safe(), self._standing())
         if not rest.safe:
-            self._recorder.event("error", "hv", f"{NOT_SAFE} {ADVICE}")
+            second = "" if guard is None else guard.second_words
+            self._recorder.event("error", "hv", f"{NOT_SAFE} {f'Also: {second}. ' if second else ''}{ADVICE}")
         return rest
-
-    def _ramp_limit(self) -> float:
-        assert self._guard is not None
-        return ramp_limit(self._guard.ramp_duration)
 
     def _off(self, cause: str, *, at_once: bool) -> None:
         guard = self._guard
@@ -109,6 +110,8 @@ class Teardown:
             added = self._recorder.add(sample)
             if isinstance(added, HVSample) and self._guard is not None:
                 self._guard.on_sample(added)
+            elif isinstance(added, MonitorSample) and self._guard is not None:
+                self._guard.on_monitor(added)
 
     def _attempt(self, role: str, act: Callable[[], None], *, heals: bool = True) -> bool:
         """Whether ``act`` succeeded. Any error at all is only reported: here nothing must stand in the way.

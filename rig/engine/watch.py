@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Sequence
 from itertools import pairwise
 
-from drivers.roles import DisplacementSample, ForceSample, HVFlag, HVSample, Sample, StageSample
+from drivers.roles import DisplacementSample, ForceSample, HVFlag, HVSample, MonitorSample, Sample, StageSample
 from rig.base.errors import FaultError, StaleData
 from rig.bench.bench import Bench
 from rig.engine.follows import ForceFollows
@@ -74,6 +74,8 @@ class Watch:
                         self._limits.displacement.check(self._recorder.quantity_of(sample), "Displacement measured")
             case HVSample():
                 self._judge_output(sample)
+            case MonitorSample() if role in self._silence:
+                self._good(role, sample)
         if isinstance(sample, StageSample) or not sample.flags:
             self.newest_good[role] = now
 
@@ -95,7 +97,7 @@ class Watch:
             self._limits.displacement.check(recorder.displacement, "Displacement measured")
         self._compare_stage_and_laser(now)
 
-    def _good(self, role: str, sample: ForceSample | DisplacementSample) -> bool:
+    def _good(self, role: str, sample: ForceSample | DisplacementSample | MonitorSample) -> bool:
         """A sensor may call single samples bad, but not several in a row: then nobody knows where the film is."""
         self._bad[role] = self._bad[role] + 1 if sample.flags else 0
         if self._bad[role] >= BAD_SAMPLES:
@@ -182,4 +184,6 @@ def allowed_silence(bench: Bench) -> dict[str, float]:
         rates["displacement"] = bench.displacement.rate
     if scene.hv is not None:
         rates["hv"] = scene.hv.sample_rate
+    if second := scene.second_reading:  # what the air is ends no run
+        rates[second] = scene.monitors[second].sample_rate
     return {role: SILENT_PERIODS / rate + scene.instruments[role].timeout_s for role, rate in rates.items()}

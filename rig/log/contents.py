@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
+from drivers.instrument import MONITORS
 from drivers.roles import Identity
 from rig.base.certificates import parse_certificate
 from rig.base.errors import ConfigError
@@ -70,7 +71,8 @@ def certificates_in(log: Log) -> dict[str, Certificate]:
                 certificate = parse_certificate(attachment.data, f"{printable(name)} inside")
             except ConfigError as error:
                 raise LogError(log.path, f"holds a certificate that cannot be used: {str(error).rstrip('.')}") from None
-            found[certificate.role] = certificate
+            role = name.split(".")[1]
+            found[role if role in MONITORS else certificate.role] = certificate  # a voltage monitor has one of a supply
     return found
 
 

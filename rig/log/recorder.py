@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from drivers.roles import DisplacementSample, ForceSample, HVSample, Identity, Sample, StageSample
+from drivers.roles import DisplacementSample, ForceSample, HVSample, Identity, MonitorSample, Sample, StageSample
 from rig.base.clock import Clock
 from rig.base.errors import FaultError
 from rig.log import space
 from rig.log.errors import LogError
+from rig.log.schema import MONITORED
 
 if TYPE_CHECKING:
     from rig.log.process import LogProcess
@@ -33,6 +34,7 @@ class Gains:
     voltage: float = 1.0
     force_unit: str = "mV/V"  # of the force sensor's readings, as its certificate has it
     stored_zero: float | None = None  # reading of the unloaded force sensor, as stored with its serial number and date
+    second: float = 1.0  # of the monitor that reads the voltage
 
 
 class Recorder:
@@ -49,6 +51,7 @@ class Recorder:
         self.force_sample: ForceSample | None = None
         self.displacement_sample: DisplacementSample | None = None
         self.hv: HVSample | None = None
+        self.monitors: dict[str, MonitorSample] = {}  # the newest, by quantity
         self.force_zero = math.nan
         self.displacement_zero = math.nan
         self.contact = math.nan
@@ -93,6 +96,8 @@ class Recorder:
         """Take in one sample, write it, and give it back; a measured voltage comes back by its certificate."""
         if isinstance(sample, HVSample):
             sample = replace(sample, voltage=sample.voltage * self._gains.voltage)
+        elif isinstance(sample, MonitorSample) and sample.quantity == "voltage":
+            sample = replace(sample, value=sample.value * self._gains.second)
         match sample:
             case ForceSample():
                 self.force_sample = sample
@@ -133,6 +138,10 @@ class Recorder:
                     setpoint_V=sample.setpoint,
                     flags=sample.flags.value,
                 )
+            case MonitorSample():
+                self.monitors[sample.quantity] = sample
+                shown = dict.fromkeys(MONITORED.values(), math.nan) | {MONITORED[sample.quantity]: sample.value}
+                self._write(f"/{sample.role}/sample", sample.t, **shown, flags=sample.flags.value)
         return sample
 
     def wire(self, role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:

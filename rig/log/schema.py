@@ -18,11 +18,12 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
+from drivers.instrument import MONITORS
 from drivers.roles import HVFlag, SampleFlag
 
 SCHEMA_VERSION = 2
 PACKAGE = "dearig.v2"
-ROLES = ("stage", "force", "displacement", "hv")
+ROLES = ("stage", "force", "displacement", "hv", *MONITORS)
 SETTINGS = ".settings"
 """Of the supply as a command's device: it is about its settings that were lent, not about its output."""
 
@@ -55,6 +56,19 @@ _RAW = Channel(
         Field("data", "bytes", "as on the wire; a CAN frame is its identifier (2 bytes, big-endian) and its data"),
     ),
 )
+
+_MONITOR = Channel(
+    "MonitorSample",
+    (
+        _T,
+        Field("voltage_V", "double", "voltage of the output by a reading of its own, in volts; NaN: not this, or none"),
+        Field("temperature_K", "double", "temperature of the air at the film, in kelvin; NaN: not this, or none"),
+        Field("relative_humidity", "double", "of the air at the film, 0 to 1; NaN: not this, or none"),
+        _FLAGS,
+    ),
+)
+MONITORED = {"voltage": "voltage_V", "temperature": "temperature_K", "humidity": "relative_humidity"}
+"""The field of a monitor's sample for each quantity."""
 
 CHANNELS: dict[str, Channel] = {
     "/stage/sample": Channel(
@@ -249,6 +263,7 @@ CHANNELS: dict[str, Channel] = {
             Field("count", "sfixed64", "how often"),
         ),
     ),
+    **{f"/{name}/sample": _MONITOR for name in MONITORS},
     **{f"/raw/{role}/{way}": _RAW for role in ROLES for way in ("rx", "tx")},
 }
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibration.sensors.certificate import Certificate
-from drivers.settings import CanSettings
+from drivers.instrument import MONITORS
+from drivers.settings import CanSettings, TcpSettings
 from rig.base import served
 from rig.base.certificates import load_certificate
 from rig.base.errors import ConfigError, LimitError
@@ -20,6 +21,7 @@ from rig.protocol.protocol import Protocol, load_protocol
 from rig.scene.scene import Scene, load_scene
 from rig.steps.base import Action
 
+HV = "hv"
 TIMES_BREAKDOWN = 10.0  # a limit of the field this far above breakdown is a slip of the unit
 # What ``dea-rig sim`` prints beside the ports, and where its pseudo-terminals are (Linux, macOS).
 SERVED_BY, SERVER = "served_by", {"program": "dea-rig sim"}
@@ -115,9 +117,13 @@ def are_served(ports: Mapping[str, object]) -> bool:
 
 
 def _all_served(scene: Scene) -> bool:
-    """Whether every port is a pseudo-terminal, behind whatever name, that one simulated bench serves."""
+    """Whether every port is a pseudo-terminal, behind whatever name, or a TCP port of this machine, that one simulated
+    bench serves."""
     names = []
     for table in scene.instruments.values():
+        if isinstance(table, TcpSettings) and table.host == served.LOOPBACK:
+            names.append(served.tcp_port(table.tcp_port))
+            continue
         name = getattr(table, "port", None)
         if isinstance(table, CanSettings) and table.interface == "slcan":
             name = table.can_channel
@@ -137,7 +143,7 @@ def certificates_of(scene: Scene, path: Path) -> dict[str, Certificate]:
             certificate = load_certificate(path.parent / table.certificate)
         except ConfigError as error:
             raise ConfigError(f"{path}: {role}.certificate: {error}") from None
-        if certificate.role != role:
+        if certificate.role != (HV if role == scene.second_reading else role):
             raise ConfigError(
                 f"{path}: {role}.certificate = {table.certificate!r}: this one is for the role {certificate.role!r}."
             )
@@ -185,4 +191,7 @@ def gains_of(certificates: dict[str, Certificate]) -> Gains:
     """Quantity per reading of each sensor, by the certificates."""
     gain = {role: certificate.gain for role, certificate in certificates.items()}
     force = certificates["force"]  # every scene names it
-    return Gains(force.gain, gain.get("displacement", 1.0), gain.get("hv", 1.0), force.reading_unit, force.stored_zero)
+    second = next((gain[name] for name in MONITORS if name in gain), 1.0)  # only that of a voltage has a certificate
+    return Gains(
+        force.gain, gain.get("displacement", 1.0), gain.get(HV, 1.0), force.reading_unit, force.stored_zero, second
+    )

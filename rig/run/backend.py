@@ -40,7 +40,10 @@ class Backend:
         try:
             if self.guard is not None:
                 self.guard.opened()  # first: nobody reads the other ports while its process comes up
-            self.bench = Bench(scene, open_ports(scene, clock), self.guard)
+            opened = open_ports(scene, clock)
+            self.bench = Bench(scene, opened, self.guard)
+            if self.guard is not None and scene.second_reading:
+                self.guard.lend_monitor(getattr(opened.links[scene.second_reading], "descriptors", ()))
         except BaseException:
             if self.guard is not None:
                 self.guard.close()

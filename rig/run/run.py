@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 
 from calibration.sensors.certificate import Certificate
+from drivers.instrument import MONITORS
 from rig.base.clock import Clock, calendar_now
 from rig.base.errors import ConfigError, FaultError, LimitError, NotSafe, Stopped
 from rig.engine.engine import Engine
@@ -144,7 +145,8 @@ def worst(outcome: Outcome, error: Exception | None) -> Exception:
         return error
     ended = "The protocol had ended." if error is None else f"What ended the run: {outcome.reason}"
     if not outcome.safe:
-        return NotSafe(f"{NOT_SAFE} {ADVICE} {ended}", device="hv", cause=outcome.reason)
+        second = f"{outcome.second[:1].upper()}{outcome.second[1:]}. " if outcome.second else ""
+        return NotSafe(f"{NOT_SAFE} {second}{ADVICE} {ended}", device="hv", cause=outcome.reason)
     if not outcome.standing and (error is None or isinstance(error, Stopped | LimitError)):
         words = "The stage did not say that it stands; it may be moving. Cut its power."
         return FaultError(f"{words} {ended}", device="stage", cause=outcome.reason)
@@ -226,7 +228,7 @@ def _attach(
             "protocol": experiment.protocol.title,
             "specimen": experiment.scene.specimen.name,
             "bench": experiment.bench,
-            "without_certificate": " ".join(role for role in uncalibrated if role != "stage"),
+            "without_certificate": " ".join(role for role in uncalibrated if role != "stage" and role not in MONITORS),
             "certificate_problems": "; ".join(problems),
         },
     )

@@ -9,11 +9,22 @@ from __future__ import annotations
 
 from rig.base.errors import FaultError
 
-UNDETECTABLE = (
-    "What cannot be detected from here: a supply whose status and reading are wrong at once; program and guard both "
-    "stopped; power lost. Interlock, emergency stop and grounding stick are for that."
-)
-"""Said whenever high voltage is asked for on ports."""
+
+def undetectable(second: str) -> str:
+    """What no software can see, said whenever high voltage is asked for on ports. ``second`` names the second reading
+    of the voltage; empty: there is none."""
+    if second:
+        known = f"A second reading of the voltage ({second}) must agree with the supply; off is only what both show."
+        hidden = ""
+    else:
+        known, hidden = (
+            "There is no second reading of the voltage.",
+            "a supply whose status and reading are wrong at once; ",
+        )
+    return (
+        f"{known} What cannot be detected from here: {hidden}program and guard both stopped; power lost. Interlock, "
+        "emergency stop and grounding stick are for that."
+    )
 
 
 class Arming:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from enum import Enum, Flag
 from typing import TYPE_CHECKING, TypeAlias
 
-from drivers.roles import GivesBack, HVFlag, HVSample, HVSupply, OwnTrip, Renewed
+from drivers.roles import GivesBack, HVFlag, HVSample, HVSupply, MonitorSample, OwnTrip, Renewed
 from rig.base.errors import Breakdown, BreakdownCurrent, FaultError, LimitError, StaleData
 from rig.safety.commanded import DEVIATION_PART, DEVIATION_V, CommandedRamp
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
@@ -22,6 +22,7 @@ from rig.safety.limits import FilmLimits, Limit, Limits
 
 if TYPE_CHECKING:
     from rig.safety.remote import RemoteGuard
+    from rig.safety.second import SecondReading
 
 AnyGuard: TypeAlias = "Guard | RemoteGuard"  # in the engine's process, or in one of its own
 
@@ -68,6 +69,8 @@ class Guard:
         ``tell(command, argument)`` is called with each command before it is given, for the log.
     fresh : mapping of str to float
         How old the newest good sample of each role may be while armed (s), by the engine's `heartbeat`.
+    second : SecondReading, optional
+        A monitor of the voltage: off is only what both show. Its readings come by `on_monitor`.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class Guard:
         ramp: float,
         tell: Callable[[str, str], None],
         fresh: Mapping[str, float] | None = None,
+        second: SecondReading | None = None,
     ) -> None:
         self.state = GuardState.SAFE
         self.cause = "not armed"
@@ -91,6 +95,7 @@ class Guard:
         self._ramp = ramp
         self._tell = tell
         self._fresh = dict(fresh or {})
+        self._second = second
         self._beat: Heartbeat | None = None
         self._alive_at: float | None = None  # when the engine last gave a sign of life; None: not yet since arming
         self.longest_silence = 0.0  # s between two signs of life while armed; to be held against DEADLINE_S
@@ -110,9 +115,26 @@ class Guard:
     def output_is_safe(self) -> bool:
         """Whether the last two samples show it *measured* below 60 V, not rising, the channel off, no ramp under way.
 
-        A low voltage alone proves nothing: an output that does not obey its off may be on its way up.
+        A low voltage alone proves nothing: an output that does not obey its off may be on its way up. Where there is a
+        second reading, that too must show it.
         """
-        return self._low_samples >= SAFE_SAMPLES
+        return self._low_samples >= SAFE_SAMPLES and self._second_shows_off
+
+    @property
+    def _second_shows_off(self) -> bool:
+        return self._second is None or (self.last is not None and self._second.shows_off(self.last.t))
+
+    @property
+    def second_words(self) -> str:
+        """What the second reading shows, in words; empty without one."""
+        if self._second is None:
+            return ""
+        return self._second.words(math.nan if self.last is None else self.last.t)
+
+    @property
+    def off_limit(self) -> float:
+        """Seconds that an emergency off may take to be measured."""
+        return AT_ONCE_S + (0.0 if self._second is None else self._second.wait_s)
 
     @property
     def ramp_duration(self) -> float:
@@ -124,7 +146,7 @@ class Guard:
     @property
     def ramp_limit(self) -> float:
         """Seconds after which an output that is ramped down must have been measured off."""
-        return ramp_limit(self.ramp_duration)
+        return ramp_limit(self.ramp_duration) + self.off_limit - AT_ONCE_S
 
     def arm(self) -> None:
         """Leave SAFE. The supply must be measurably off and free of faults.
@@ -184,6 +206,12 @@ class Guard:
         low = self.last is not None and abs(self.last.voltage) < SAFE_VOLTAGE
         if self.last is not None and low and HVFlag.ON in self.last.flags:
             raise FaultError("hv: cannot be used, the channel is on already. Nothing was changed. Switch it off first.")
+        if self.last is not None and low and self._low_samples >= SAFE_SAMPLES and not self._second_shows_off:
+            raise FaultError(
+                f"hv: cannot be used, the supply says that its output is off, but {self.second_words}. Off is "
+                "what both show. Nothing was changed. Check the monitor and its probe; if the output is live, take it "
+                "down by hand; start again."
+            )
         if self.last is None or not self.output_is_safe:
             measured = "not measured yet" if self.last is None else f"{self.last.voltage:.0f} V"
             raise FaultError(
@@ -195,6 +223,8 @@ class Guard:
         """Ramp down and switch off an output that was found live, by the operator's choice; the latch stays SAFE."""
         self.commanded = self.ramps_down = True
         self._low_samples = 0
+        if self._second is not None:
+            self._second.expect_off()
         self._expect(0.0)
         try:
             self._tell("take_down", f"ramp {self._ramp!r} V/s; {cause}")
@@ -251,6 +281,8 @@ class Guard:
             self._supply.switch_on()
             self.state = GuardState.LIVE
         self._low_samples = 0
+        if self._second is not None:
+            self._second.expect_off()
 
     def _expect(self, volts: float) -> None:
         """From here on the output is held against a ramp to ``volts``."""
@@ -310,6 +342,7 @@ class Guard:
         """
         if self.state is not GuardState.SAFE:
             self._judge_engine(now)
+            self._judge_second_age(now)
         h = self._beat.displacement if self._beat is not None else math.nan
         cut = self.state is GuardState.SAFE and not self.ramps_down  # an off that is given again and again is not heard
         live = self.commanded and not self.output_is_safe and not cut
@@ -338,6 +371,14 @@ class Guard:
                 self.ramp_off(cause)
                 raise StaleData(f"hv: {cause}; the guard ramps the output down.")
 
+    def _judge_second_age(self, now: float) -> None:
+        try:
+            if self._second is not None:
+                self._second.check_age(now)
+        except StaleData as error:
+            self.ramp_off(str(error))
+            raise
+
     @property
     def _voltage(self) -> float:
         """The higher of what is set and what is measured."""
@@ -359,6 +400,8 @@ class Guard:
             monitor is frozen, whoever takes the voltage down.
         """
         before, self.last = self.last, sample
+        if self._second is not None:
+            self._second.on_supply(sample)
         below = abs(sample.voltage) < SAFE_VOLTAGE  # False for NaN
         rises = before is not None and abs(sample.voltage) > abs(before.voltage) + AWAY_V
         off = below and not rises and not sample.flags & DRIVEN
@@ -377,6 +420,21 @@ class Guard:
             kind = Breakdown if faults & ARC else FaultError
             raise kind(f"hv: the supply reports {flag_names(faults)}.")
         self._judge_deviation(sample, before)
+
+    def on_monitor(self, sample: MonitorSample) -> None:
+        """Judge one reading of the monitor. It can end a run and keep an output from counting as off, nothing else.
+
+        Raises
+        ------
+        LimitError, FaultError
+            While there is voltage: it is outside its limit, or supply and monitor disagree.
+        """
+        if self._second is None or sample.role != self._second.role:
+            return
+        self._second.take(sample)
+        goes_down = self.ramps_down and self.commanded and not self.output_is_safe
+        if self.state is GuardState.LIVE or goes_down:
+            self._second.judge()
 
     def _judge_frozen(self, sample: HVSample) -> None:
         """A monitor that shows the very same for too long, or while the output must be moving, tells nothing any more.
@@ -502,6 +560,8 @@ class Guard:
             self._supply.emergency_off()
 
     def _latch(self, cause: str, *, ramps_down: bool) -> None:
+        if self._second is not None and self.state is not GuardState.SAFE:  # not each time that an off is repeated
+            self._second.expect_off()
         self.state = GuardState.SAFE
         self.ramps_down = ramps_down
         self.cause = cause

@@ -15,6 +15,7 @@ belongs to the hardware, to interlock loop, emergency stop and bleed resistor.
 from __future__ import annotations
 
 import json
+import math
 import os
 import select
 import signal
@@ -29,7 +30,7 @@ from typing import Literal
 import click
 
 from drivers.links.link import DeviceError, DeviceLost
-from drivers.roles import GivesBack, HVSample, HVSupply
+from drivers.roles import GivesBack, HVSample, HVSupply, MonitorSample, SampleFlag
 from drivers.settings import SupplySettings
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, RigError
@@ -38,10 +39,12 @@ from rig.bench.devices import ROLE, Link, make_supply
 from rig.log.errors import LogError
 from rig.log.recorder import Severity
 from rig.log.remote import RemoteLog
-from rig.log.schema import SETTINGS
+from rig.log.schema import MONITORED, SETTINGS
 from rig.safety.channel import Channel, ChannelDamaged, Message
-from rig.safety.guard import ADVICE, AT_ONCE_S, GIVE_BACK, NOT_SAFE, Guard, GuardState
+from rig.safety.guard import ADVICE, GIVE_BACK, NOT_SAFE, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
+from rig.safety.second import SecondReading
+from rig.safety.taken_over import TakenOver
 from rig.scene.scene import Scene
 
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005
@@ -142,6 +145,7 @@ class Server:
         self._supply: HVSupply | None = None
         self._guard: Guard | None = None
         self._gain = 1.0
+        self._monitor: TakenOver | None = None  # read from here only when the engine has gone
         self._polled_at = 0.0
         self._log: RemoteLog | None = None
         self._next_state = self._next_alive = 0.0
@@ -210,6 +214,10 @@ class Server:
             assert isinstance(raw, HVSample)
             self._tell_sample(raw)
             guard.on_sample(self._by_certificate(raw))
+        if self._channel.closed and self._monitor is not None:
+            for reading in self._monitor.poll(self._polled_at):
+                self._tell_reading(reading)
+                self._take_reading(reading)
 
     def _find_again(self) -> None:
         """Open a link that was lost as soon as it is back; the off is sent at once then."""
@@ -267,7 +275,7 @@ class Server:
             return
         if self._off_at is None or (self._off_ramps and not guard.ramps_down):
             self._off_at, self._off_ramps = now, guard.ramps_down
-            self._off_limit = guard.ramp_limit if guard.ramps_down else AT_ONCE_S
+            self._off_limit = guard.ramp_limit if guard.ramps_down else guard.off_limit
             self._again = now + INSIST_S
         late = now - self._off_at > self._off_limit
         if self._off_ramps:
@@ -275,7 +283,7 @@ class Server:
                 self._off(guard, f"{guard.cause}; hastened, the ramp has taken {now - self._off_at:.0f} s")
         elif late and not self._told_not_safe:
             self._told_not_safe = True
-            message = f"{NOT_SAFE} {ADVICE}"
+            message = f"{NOT_SAFE} {_sentence(guard.second_words)}{ADVICE}"
             self._tell_event("error", message)
             self._words.say(f"dea-rig guard: {message} It is told again until it obeys (process {os.getpid()}).")
         elif now >= self._again:
@@ -289,6 +297,12 @@ class Server:
             case "heartbeat":
                 if self._guard is not None:
                     self._guard.heartbeat(bytes.fromhex(message["data"]), self._clock.now())
+            case "reading":
+                t, value, flags = message["values"]
+                self._take_reading(MonitorSample(t, self._scene.second_reading, "voltage", value, SampleFlag(flags)))
+            case "monitor":
+                handles, self._channel.handles = tuple(self._channel.handles), []
+                self._monitor = TakenOver(self._scene, handles)
             case "call":
                 self._answer(message)
             case "appoint":
@@ -301,6 +315,14 @@ class Server:
             case other:
                 raise FaultError(f"hv: the engine asks the guard for {other!r}, which it does not know.")
 
+    def _take_reading(self, reading: MonitorSample) -> None:
+        """What the monitor shows may take the output off; what else the engine asks is heard all the same."""
+        try:
+            if self._guard is not None:
+                self._guard.on_monitor(reading)
+        except RigError as error:
+            self._fault(error)
+
     def _appoint(self, message: Message) -> None:
         """Put the driver on its link: from here on it is polled."""
         self._gain = float(message["gain"])
@@ -309,7 +331,11 @@ class Server:
         film = FilmLimits(self._scene.specimen.specimen(), limits)
         film.capacitance(0.0, 0.0)  # the model's first answer takes longest
         fresh = {str(role): float(age) for role, age in message["fresh"].items()}
-        self._guard = Guard(self._supply, limits, film, self._table.ramp_V_per_s, self._tell_command, fresh)
+        second = SecondReading.of(self._scene, limits.measured_voltage.high)
+        ramp = self._table.ramp_V_per_s
+        self._guard = Guard(self._supply, limits, film, ramp, self._tell_command, fresh, second)
+        if self._monitor is not None:
+            self._monitor.gain = float(message["second_gain"])
 
     def _answer(self, message: Message) -> None:
         guard, supply = self._guard, self._supply
@@ -340,6 +366,7 @@ class Server:
                 "setpoint": guard.setpoint,
                 "output_is_safe": guard.output_is_safe,
                 "ramp_duration": guard.ramp_duration,
+                "second_words": guard.second_words,
                 "given_back": guard.given_back,
                 "found": dict(supply.found) if isinstance(supply, GivesBack) else {},
                 "ready": supply.ready,
@@ -372,6 +399,11 @@ class Server:
         one = self._by_certificate(raw)
         fields = {"voltage_V": one.voltage, "current_A": one.current, "setpoint_V": one.setpoint}
         self._record("/hv/sample", one.t, **fields, flags=one.flags.value)
+
+    def _tell_reading(self, one: MonitorSample) -> None:
+        nothing = dict.fromkeys(MONITORED.values(), math.nan)
+        fields = nothing | {MONITORED[one.quantity]: one.value}
+        self._record(f"/{one.role}/sample", one.t, **fields, flags=one.flags.value)
 
     # The log ---------------------------------------------------------------------------------------------------
 
@@ -418,10 +450,12 @@ class Server:
             self._wait()
         self._give_back(guard)
         measured = guard.last.voltage if guard.last is not None else float("nan")
+        second = _sentence(guard.second_words)
         if guard.output_is_safe:
-            message = f"{cause}. The high voltage is off, measured {measured:.0f} V."
+            message = f"{cause}. The high voltage is off, measured {measured:.0f} V. {second}".rstrip()
         else:
-            message = f"{cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {ADVICE} The guard has ended."
+            message = f"{cause}. NOT SAFE: high voltage last measured {measured:.0f} V. {second}{ADVICE} "
+            message += "The guard has ended."
         self._tell_event("error", message)
         self._words.say(f"dea-rig guard: {message}")
         end = time.monotonic() + SPEAK_S
@@ -446,6 +480,11 @@ def _obey_signals(ended_by: list[int]) -> None:
         number = getattr(signal, name)
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, lambda number, frame: ended_by.append(number))
+
+
+def _sentence(words: str) -> str:
+    """``words`` as a sentence with a blank after it; nothing of nothing."""
+    return f"{words[:1].upper()}{words[1:]}. " if words else ""
 
 
 def _measured_off(guard: Guard) -> bool:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
-from drivers.roles import GivesBack, HVFlag, HVSample, HVSupply, Identity, Sample
+from drivers.roles import GivesBack, HVFlag, HVSample, HVSupply, Identity, MonitorSample, Sample
 from rig.base.clock import RealClock
 from rig.base.errors import FaultError, from_fields
 from rig.bench.devices import ROLE, Link, make_supply
@@ -27,8 +27,9 @@ from rig.bench.tap import Tap
 from rig.log.recorder import Severity
 from rig.safety import process, start
 from rig.safety.channel import Channel, ChannelDamaged, Message
-from rig.safety.guard import Guard, GuardState
+from rig.safety.guard import AT_ONCE_S, Guard, GuardState, ramp_limit
 from rig.safety.limits import FilmLimits, Limits
+from rig.safety.second import SecondReading
 from rig.scene.scene import Scene
 
 START_S = 30.0  # until the process must have the link; a slow disk has many modules to read
@@ -68,6 +69,9 @@ class RemoteGuard:
         self.output_is_safe = False
         self.ramp_duration = 0.0
         self.given_back = True
+        second = SecondReading.of(scene, Limits.of(scene).measured_voltage.high)
+        self.second_words = "" if second is None else second.words()
+        self.off_limit = AT_ONCE_S + (0.0 if second is None else second.wait_s)
         self._found: dict[str, float] = {}  # what arming changes in the supply, as the guard found it
         self.last: HVSample | None = None
         self._scene = scene
@@ -142,9 +146,15 @@ class RemoteGuard:
         """
         self._channel.hand_over({"do": "log", "path": str(path)}, end.fileno())
 
+    def lend_monitor(self, descriptors: Sequence[int]) -> None:
+        """Give the process descriptors of the voltage's monitor, to read on should this process end. As `log_to`."""
+        if descriptors:
+            self._channel.hand_over({"do": "monitor"}, *descriptors)
+
     def appoint(
         self,
         gain: float,
+        second_gain: float,
         fresh: Mapping[str, float],
         tell: Callable[[str, str, float], None],
         event: Callable[[Severity, str], None],
@@ -155,6 +165,8 @@ class RemoteGuard:
         ----------
         gain : float
             Volts per volt that the supply states, from its certificate.
+        second_gain : float
+            The same of the monitor of the voltage.
         fresh
             As `Guard` takes it.
         tell : callable
@@ -165,7 +177,7 @@ class RemoteGuard:
         self._tell, self._event = tell, event
         if self._link is not None:
             self._make_ready(self._link)
-        self._channel.send({"do": "appoint", "gain": gain, "fresh": dict(fresh)})
+        self._channel.send({"do": "appoint", "gain": gain, "second_gain": second_gain, "fresh": dict(fresh)})
         self._heard_at = self._clock.now()  # it has had nothing to say until now
 
     # As a device ---------------------------------------------------------------------------------------------
@@ -261,6 +273,22 @@ class RemoteGuard:
             guard.on_sample(sample)
             self._mirror(guard)
 
+    def on_monitor(self, sample: MonitorSample) -> None:
+        """Pass a reading of the monitor on; what the guard thinks of it comes with the next `poll`."""
+        if sample.quantity != "voltage":
+            return
+        if self._lost and self._successor is not None:
+            guard = self._successor[1]
+            guard.on_monitor(sample)
+            self._mirror(guard)
+        else:
+            self._channel.send({"do": "reading", "values": [sample.t, sample.value, sample.flags.value]})
+
+    @property
+    def ramp_limit(self) -> float:
+        """As `Guard.ramp_limit`."""
+        return ramp_limit(self.ramp_duration) + self.off_limit - AT_ONCE_S
+
     # The process ---------------------------------------------------------------------------------------------
 
     def _call(self, name: str, *arguments: Any) -> None:
@@ -332,6 +360,7 @@ class RemoteGuard:
         self.setpoint = message["setpoint"]
         self.output_is_safe = message["output_is_safe"]
         self.ramp_duration = message["ramp_duration"]
+        self.second_words = message["second_words"]
         self.given_back, self._found = message.get("given_back", True), message.get("found", {})
         self.ready = message["ready"]
         self.identity = Identity(*message["identity"])
@@ -362,7 +391,8 @@ class RemoteGuard:
         supply = make_supply(self._table, link, self._tap, self._clock.now)
         limits = Limits.of(self._scene)
         film = FilmLimits(self._scene.specimen.specimen(), limits)
-        self._successor = supply, Guard(supply, limits, film, self._table.ramp_V_per_s, self._tell_now)
+        second = SecondReading.of(self._scene, limits.measured_voltage.high)
+        self._successor = supply, Guard(supply, limits, film, self._table.ramp_V_per_s, self._tell_now, None, second)
 
     def _take_over(self) -> None:
         """Command the output off, if it was ever commanded on."""
@@ -436,6 +466,7 @@ class RemoteGuard:
         self.state, self.cause, self.commanded = guard.state, guard.cause, guard.commanded
         self.setpoint, self.output_is_safe = guard.setpoint, guard.output_is_safe
         self.ramp_duration, self.given_back = guard.ramp_duration, guard.given_back
+        self.second_words = guard.second_words
 
 
 def unpack_error(message: Message) -> Exception:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 from pydantic import Field
 
 from drivers.registry import of_role
-from drivers.settings import ForceSettings, InstrumentSettings, StageSettings, SupplySettings
+from drivers.settings import ForceSettings, InstrumentSettings, MonitorSettings, StageSettings, SupplySettings
 
 
 def _any_of(role: str) -> Any:
@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     AnyForce = ForceSettings
     AnyDisplacement = InstrumentSettings
     AnySupply = SupplySettings
+    AnyMonitor = MonitorSettings
 else:
     AnyStage = _any_of("stage")
     AnyForce = _any_of("force")
     AnyDisplacement = _any_of("displacement")
     AnySupply = _any_of("hv")
+    AnyMonitor = _any_of("monitor")

@@ -16,14 +16,14 @@ from pydantic import Field, model_validator
 
 from drivers.links.can_link import SHARED
 from drivers.registry import of_role, registered
-from drivers.settings import CanSettings, InstrumentSettings, Positive
+from drivers.settings import CanSettings, InstrumentSettings, MonitorSettings, Positive
 from rig.base.errors import ConfigError
 from rig.base.table import Table
 from rig.base.toml_file import load_table, validate
-from rig.scene.instruments import AnyDisplacement, AnyForce, AnyStage, AnySupply
+from rig.scene.instruments import AnyDisplacement, AnyForce, AnyMonitor, AnyStage, AnySupply
 from rig.scene.specimen import SpecimenTable
 from rig.sim.settings import SimulationSettings
-from rig.sim.truth import ROLES
+from rig.sim.truth import MONITORS, ROLES
 from rig.sim.twins import of_role as twins_of_role
 from rig.sim.twins import registered as registered_twins
 
@@ -145,6 +145,13 @@ class Scene(Table):
     hv: AnySupply | None = Field(
         default=None, description="The high-voltage supply. Absent: no electrostatics, no permittivity."
     )
+    monitor: AnyMonitor | None = Field(
+        default=None,
+        description="A slow reading beside those of the rig. Of the voltage: an independent one, that must agree with "
+        "the supply; the output is off only when both say so. Or of the air. Absent: none.",
+    )
+    monitor_2: AnyMonitor | None = Field(default=None, description="Another one, of another quantity. Absent: none.")
+    monitor_3: AnyMonitor | None = Field(default=None, description="A third one. Absent: none.")
     simulation: SimulationSettings | None = Field(
         default=None, description="The simulated bench: the truth behind film and instruments, and their faults."
     )
@@ -172,6 +179,8 @@ class Scene(Table):
             table, truth = raw.get(role), simulation.get(role, {})
             if isinstance(table, dict) and isinstance(truth, dict) and str(table.get("driver")) in twins_of_role(role):
                 simulation[role] = {"driver": table["driver"], **truth}
+                if role in MONITORS and "quantity" in table:
+                    simulation[role] = {"quantity": table["quantity"], **simulation[role]}
         return raw | {"simulation": simulation}
 
     @model_validator(mode="after")
@@ -201,6 +210,7 @@ class Scene(Table):
                 )
         self._check_buses()
         self._check_current_limit()
+        self._check_monitors()
         if self.hv is None and self.limits.voltage_V is not None:
             raise ValueError("limits.voltage_V is given but there is no [hv] instrument")
         return self
@@ -235,11 +245,31 @@ class Scene(Table):
                 "could hold it to that limit; leave the limit out and limit the current by hardware"
             )
 
+    def _check_monitors(self) -> None:
+        seen: dict[str, str] = {}
+        for name, table in self.monitors.items():
+            if table.quantity in seen:
+                raise ValueError(f"{seen[table.quantity]} and {name} both read the {table.quantity}; one is enough")
+            seen[table.quantity] = name
+        if "voltage" in seen and self.hv is None:
+            raise ValueError(f'{seen["voltage"]}.quantity = "voltage", but there is no [hv] instrument')
+
+    @property
+    def monitors(self) -> dict[str, MonitorSettings]:
+        """The slow readings beside those of the rig, by name."""
+        tables = {name: getattr(self, name) for name in MONITORS}
+        return {name: table for name, table in tables.items() if table is not None}
+
+    @property
+    def second_reading(self) -> str:
+        """Name of the monitor that reads the voltage; empty: there is none."""
+        return next((name for name, table in self.monitors.items() if table.quantity == "voltage"), "")
+
     @cached_property
     def instruments(self) -> dict[str, InstrumentSettings]:
         """The instruments that the scene names, by role, in the order in which they are polled."""
         tables = {"stage": self.stage, "force": self.force, "displacement": self.displacement, "hv": self.hv}
-        return {role: table for role, table in tables.items() if table is not None}
+        return {role: table for role, table in tables.items() if table is not None} | self.monitors
 
     @property
     def rates(self) -> dict[str, float]:

@@ -19,7 +19,7 @@ from rig.sim.faults import Upset
 from rig.sim.film import Solve, solve_membrane
 from rig.sim.operator import Operator
 from rig.sim.settings import SimulationSettings
-from rig.sim.truth import LINK_FAULTS, ROLES, Fault
+from rig.sim.truth import LINK_FAULTS, MONITORS, ROLES, Fault, role_of
 from rig.sim.twin import SimulatedInstrument, Unasked
 from rig.sim.twins import registered
 from rig.sim.wire import ByteWire, FrameWire
@@ -36,7 +36,7 @@ class _Timed(Protocol):
 
 
 class SimulatedBench:
-    """The instruments of ``roles`` (stage, force, displacement, hv) and the specimen between them.
+    """The instruments of ``roles`` (`rig.sim.truth.ROLES`) and the specimen between them.
 
     Attributes
     ----------
@@ -72,7 +72,8 @@ class SimulatedBench:
             if role in roles:
                 self._build(role)
         # The order of things that happen at one time: sensors see the world as it was, then it moves on.
-        self._sensors: list[_Timed] = [self.instruments[r] for r in ("force", "displacement") if r in roles]
+        sensors = ("force", "displacement", *MONITORS)
+        self._sensors: list[_Timed] = [self.instruments[name] for name in sensors if name in roles]
         self._actors: list[_Timed] = [self.world, *(self.instruments[r] for r in ("stage", "hv") if r in roles)]
         # Serial lines deliver before buses: the order of things that arrive at one time is part of a run.
         wires = [(wire, self.instruments[role]) for role, wire in self._wire.items()]
@@ -90,7 +91,7 @@ class SimulatedBench:
     def _build(self, role: str) -> None:
         truth = self.settings.truth(role)
         wire = self._wire[role] = truth.wire()
-        twin = registered().twins[role, truth.driver]
+        twin = registered().twins[role_of(role), truth.driver]
         self.instruments[role] = twin.make(truth, self.world, wire, self._rng(role))
 
     def prepare(self) -> None:

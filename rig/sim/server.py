@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from rig.base.clock import Clock
-from rig.base.served import Announcement
+from rig.base.served import Announcement, tcp_port
 from rig.sim.slcan import SlcanAdapter
 from rig.sim.wire import ByteWire, FrameWire, TcpWire, WireGone
 
@@ -281,7 +281,9 @@ class Server:
             port.close()
 
     def _announce(self) -> None:
-        self._announcement.say(port.name for port in self._ports.values() if isinstance(port, _Port))
+        self._announcement.say(
+            tcp_port(port.number) if isinstance(port, _TcpPort) else port.name for port in self._ports.values()
+        )
 
 
 def _comes_last(port: _Port | _TcpPort) -> bool:

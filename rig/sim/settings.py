@@ -6,10 +6,25 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, Union
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from rig.sim.truth import Fault, InstrumentTruth, LoadCellTruth, OutputTruth, RigTruth, StageTruth
+from rig.sim.truth import (
+    Fault,
+    InstrumentTruth,
+    LoadCellTruth,
+    MonitorTruth,
+    OutputTruth,
+    RigTruth,
+    StageTruth,
+    role_of,
+)
 from rig.sim.twins import of_role
 
-DEFAULTS = {"stage": "zaber", "force": "gsv8", "displacement": "keyence-lkg", "hv": "iseg-edcp"}
+DEFAULTS = {
+    "stage": "zaber",
+    "force": "gsv8",
+    "displacement": "keyence-lkg",
+    "hv": "iseg-edcp",
+    "monitor": "scpi",
+}
 """Which instrument is simulated where no scene says it, by role."""
 
 
@@ -30,9 +45,9 @@ def _any_of(role: str) -> Any:
 
 def _default(role: str) -> Any:
     def make() -> InstrumentTruth:
-        return of_role(role)[DEFAULTS[role]].truth()  # type: ignore[call-arg] # each has a default driver
+        return of_role(role)[DEFAULTS[role_of(role)]].truth()  # type: ignore[call-arg] # each has a default driver
 
-    return Field(default_factory=make, description=f"The simulated {role} instrument.")
+    return Field(default_factory=make, description=f"The simulated {role.replace('_', ' ')} instrument.")
 
 
 if TYPE_CHECKING:
@@ -40,11 +55,13 @@ if TYPE_CHECKING:
     AnyForceTruth = LoadCellTruth
     AnyDisplacementTruth = InstrumentTruth
     AnyOutputTruth = OutputTruth
+    AnyMonitorTruth = MonitorTruth
 else:
     AnyStageTruth = _any_of("stage")
     AnyForceTruth = _any_of("force")
     AnyDisplacementTruth = _any_of("displacement")
     AnyOutputTruth = _any_of("hv")
+    AnyMonitorTruth = _any_of("monitor")
 
 
 class SimulationSettings(RigTruth):
@@ -57,6 +74,9 @@ class SimulationSettings(RigTruth):
     force: AnyForceTruth = _default("force")
     displacement: AnyDisplacementTruth = _default("displacement")
     hv: AnyOutputTruth = _default("hv")
+    monitor: AnyMonitorTruth = _default("monitor")
+    monitor_2: AnyMonitorTruth = _default("monitor_2")
+    monitor_3: AnyMonitorTruth = _default("monitor_3")
     fault: list[Fault] = Field(default_factory=list, description="What goes wrong, and when.")
 
     @model_validator(mode="after")

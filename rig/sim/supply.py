@@ -12,6 +12,7 @@ class Output(Protocol):
     """What the faults need of a supply."""
 
     stuck_on: bool
+    lies: bool  # it says that it is off and measures 0 V, whatever its output does
 
     @property
     def largest_current(self) -> float: ...
@@ -24,6 +25,8 @@ def switch_output(supply: Output, world: World, fault: Fault, begins: bool, t: f
     match fault.kind:
         case "stuck_on":
             supply.stuck_on = begins
+        case "lies":
+            supply.lies = supply.stuck_on = begins
         case "breakdown":
             world.broken_down = begins
         case "over_current":

@@ -21,8 +21,17 @@ from rig.sim.wire import ByteWire, FrameWire, TcpWire
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Role = Literal["stage", "force", "displacement", "hv"]
-ROLES: tuple[Role, ...] = ("stage", "force", "displacement", "hv")
+Role = Literal["stage", "force", "displacement", "hv", "monitor"]
+Name = Literal["stage", "force", "displacement", "hv", "monitor", "monitor_2", "monitor_3"]
+MONITORS: tuple[Name, ...] = ("monitor", "monitor_2", "monitor_3")
+ROLES: tuple[Name, ...] = ("stage", "force", "displacement", "hv", *MONITORS)
+"""Names of the instruments of a bench, in the order in which they are polled."""
+
+
+def role_of(name: str) -> str:
+    """The role of the instrument of this name."""
+    return "monitor" if name in MONITORS else name
+
 
 LINK_FAULTS = ("delay", "drop", "split", "merge", "duplicate", "corrupt", "silent", "vanish")
 SWITCHES = (*LINK_FAULTS, "alert", "reset", "saturate", "freeze", "wrong_status")
@@ -44,7 +53,7 @@ class Fault(Table):
     the shvps: the mode) for wrong_status of force and hv.
     """
 
-    role: Role = Field(description="Instrument that has the fault.")
+    role: Name = Field(description="Instrument that has the fault.")
     kind: str = Field(description="What goes wrong; which faults an instrument can have, its error message lists.")
     at_s: NotNegative = Field(default=0.0, description="When it begins (s after the start).")
     duration_s: Positive | None = Field(default=None, description="How long it lasts (s). Absent: until the end.")
@@ -152,7 +161,7 @@ class LoadCellTruth(InstrumentTruth):
 class OutputTruth(InstrumentTruth):
     """What every simulated supply has, and what hangs on its output."""
 
-    more_faults: ClassVar[tuple[str, ...]] = ("stuck_on", "breakdown", "over_current", "sag")
+    more_faults: ClassVar[tuple[str, ...]] = ("stuck_on", "breakdown", "over_current", "sag", "lies")
 
     fall_time_s: Positive = Field(default=0.05, description="Time in which the output falls to zero when cut (s).")
     gain_error: float = Field(
@@ -177,6 +186,24 @@ class OutputTruth(InstrumentTruth):
         default=10.0, description="Resistance of the film once it has broken down (kOhm)."
     )
     start_live_V: NotNegative = Field(default=0.0, description="Output found on at this voltage (V); 0: found off.")
+
+
+class MonitorTruth(InstrumentTruth):
+    """What every simulated instrument has that reads something beside the rig."""
+
+    quantity: Literal["voltage", "temperature", "humidity"] = Field(
+        default="voltage", description="What it is connected to; the scene fills it in."
+    )
+    units_per_number: float = Field(
+        default=1000.0, description="What a number of 1 that it reads stands for (V, C, %): 1000 behind a 1000:1 probe."
+    )
+    temperature_C: float = Field(default=23.0, description="Temperature of the air (degrees Celsius).")
+    humidity_percent: Annotated[float, Field(ge=0, le=100)] = Field(
+        default=45.0, description="Relative humidity of the air (%)."
+    )
+    gain_error: float = Field(default=0.0, description="Hidden relative error of probe and meter. Typical: +-0.01.")
+    zero_offset: float = Field(default=0.0, description="What it shows too much (V, C, %). Typical: 0 to 2 V.")
+    noise: NotNegative = Field(default=0.2, description="Standard deviation of a reading (V, C, %).")
 
 
 class MaxwellBranch(Table):

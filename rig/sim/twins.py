@@ -13,6 +13,7 @@ from pkgutil import iter_modules
 from typing import NamedTuple
 
 import rig.sim.instruments
+from rig.sim.truth import role_of
 from rig.sim.twin import Twin
 
 GROUP = "dea_rig.twins"
@@ -41,8 +42,8 @@ def registered() -> Registered:
 
 
 def of_role(role: str) -> dict[str, Twin]:
-    """The twins of a role, by driver name."""
-    return {one.driver: one for one in registered().twins.values() if one.role == role}
+    """The twins of a role, by driver name; ``role`` may be a bench's name for it."""
+    return {one.driver: one for one in registered().twins.values() if one.role == role_of(role)}
 
 
 def _add(found: Registered, twins: tuple[Twin, ...]) -> None:

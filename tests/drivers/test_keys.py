@@ -93,6 +93,37 @@ labjack-displacement  tcp_port                 502   1   65535
 labjack-displacement  ain                      3     0   13
 labjack-displacement  mm_per_V                 needed - -
 labjack-displacement  rate_Hz                  50.0  (0  200
+labjack-monitor       timeout_s                0.25  (0  10
+labjack-monitor       boot_s                   10.0  0   60
+labjack-monitor       tcp_port                 502   1   65535
+labjack-monitor       ain                      4     0   13
+labjack-monitor       rate_Hz                  5.0   0.05 100
+labjack-monitor       factor                   1.0   -   -
+labjack-monitor       offset                   0.0   -   -
+labjack-monitor       agrees_within_V          50.0  (0  -
+labjack-monitor       agrees_within_percent    5.0   0   50
+labjack-monitor       lag_s                    0.5   0   5
+scpi                  timeout_s                1.0   (0  10
+scpi                  boot_s                   10.0  0   60
+scpi                  tcp_port                 5025  1   65535
+scpi                  rate_Hz                  2.0   0.05 100
+scpi                  factor                   1.0   -   -
+scpi                  offset                   0.0   -   -
+scpi                  agrees_within_V          50.0  (0  -
+scpi                  agrees_within_percent    5.0   0   50
+scpi                  lag_s                    0.5   0   5
+ascii-stream:monitor  timeout_s                0.25  (0  10
+ascii-stream:monitor  baud                     115200 (0 -
+ascii-stream:monitor  rate_Hz                  5.0   0.05 100
+ascii-stream:monitor  columns                  1     1   32
+ascii-stream:monitor  column                   1     1   32
+ascii-stream:monitor  factor                   1.0   -   -
+ascii-stream:monitor  limit                    10000.0 (0 -
+ascii-stream:monitor  boot_s                   3.0   0   30
+ascii-stream:monitor  offset                   0.0   -   -
+ascii-stream:monitor  agrees_within_V          50.0  (0  -
+ascii-stream:monitor  agrees_within_percent    5.0   0   50
+ascii-stream:monitor  lag_s                    0.5   0   5
 ascii-stream          timeout_s                0.25  (0  10
 ascii-stream          baud                     115200 (0 -
 ascii-stream          rate_Hz                  80.0  (0  1000
@@ -113,12 +144,19 @@ NEEDED: dict[str, dict[str, Any]] = {
     "labjack-amplifier": {"preset": "trek-610e"},
     "labjack-force": {"newtons_per_V": 1.0},
     "labjack-displacement": {"mm_per_V": 1.0},
+    **{key: {"quantity": "humidity"} for key in ("labjack-monitor", "scpi", "ascii-stream:monitor")},
 }
 ROWS = [line.split() for line in DOCUMENTED.strip().splitlines()]
 
 
+def name_of(one: Instrument) -> str:
+    """Its driver; where a monitor has that of another role, both."""
+    shared = one.role == "monitor" and len([other for other in INSTRUMENTS if other.driver == one.driver]) > 1
+    return f"{one.driver}:monitor" if shared else one.driver
+
+
 def settings_of(driver: str) -> type[InstrumentSettings]:
-    return next(one.settings for one in INSTRUMENTS if one.driver == driver)
+    return next(one.settings for one in INSTRUMENTS if name_of(one) == driver)
 
 
 def numeric(field: FieldInfo) -> bool:
@@ -135,7 +173,7 @@ def kinds(annotation: Any) -> set[Any]:
 
 def usual(driver: str) -> dict[str, Any]:
     """The keys that must be there."""
-    return {"driver": driver, "certificate": "c.toml", **NEEDED.get(driver, {})}
+    return {"driver": driver.partition(":")[0], "certificate": "c.toml", **NEEDED.get(driver, {})}
 
 
 def accepts(driver: str, key: str, value: Any) -> bool:
@@ -143,7 +181,7 @@ def accepts(driver: str, key: str, value: Any) -> bool:
     table = {**usual(driver), key: value}
     if key in ("voltage_ain", "current_ain"):
         table["current_ain" if key == "voltage_ain" else "voltage_ain"] = 5
-    if driver == "ascii-stream" and key == "column":
+    if driver.startswith("ascii-stream") and key == "column":
         table["columns"] = 32
     if driver == "cia404" and key == "factor":
         table["unit"] = "N"
@@ -168,7 +206,7 @@ def test_every_key_is_described(one: Instrument) -> None:
 
 def test_every_number_is_documented_here() -> None:
     built_in = [one for one in INSTRUMENTS if one.settings.__module__.startswith("drivers.")]
-    keys = {(one.driver, name) for one in built_in for name, f in one.settings.model_fields.items() if numeric(f)}
+    keys = {(name_of(one), name) for one in built_in for name, f in one.settings.model_fields.items() if numeric(f)}
     assert {(driver, key) for driver, key, *_ in ROWS} == keys
 
 
@@ -198,7 +236,7 @@ def test_default_and_range_are_the_documented_ones(driver: str, key: str, defaul
 @pytest.mark.parametrize("one", INSTRUMENTS, ids=lambda one: one.driver)
 def test_no_key_of_another_instrument_is_taken(one: Instrument) -> None:
     keys = {name for other in INSTRUMENTS for name in other.settings.model_fields} - set(one.settings.model_fields)
-    table = usual(one.driver)
+    table = usual(name_of(one))
     TypeAdapter(one.settings).validate_python(table)
     for key in (*keys, "no_such_key"):
         with pytest.raises(ValidationError, match="Extra inputs"):
@@ -207,7 +245,7 @@ def test_no_key_of_another_instrument_is_taken(one: Instrument) -> None:
 
 @pytest.mark.parametrize("one", INSTRUMENTS, ids=lambda one: one.driver)
 def test_what_names_its_port_makes_it_connected(one: Instrument) -> None:
-    table = usual(one.driver)
+    table = usual(name_of(one))
     assert not one.settings.model_validate(table).connected
     where = {"port": "p", "interface": "virtual", "can_channel": "c", "host": "127.0.0.1"}
     placed = one.settings.model_validate({**table, **{key: where[key] for key in one.settings.place_keys}})

@@ -24,7 +24,8 @@ from rig.bench.memory_link import MemoryByteLink, MemoryFrameLink
 from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
 from rig.sim.instruments.gsv8 import GSV8Truth
-from rig.sim.instruments.iseg import DISABLED, OFF_AT_ONCE, IsegTruth
+from rig.sim.instruments.iseg import IsegTruth
+from rig.sim.instruments.iseg.words import DISABLED, OFF_AT_ONCE
 from rig.sim.settings import SimulationSettings
 from rig.sim.truth import Fault
 from rig.sim.wire import ByteWire, FrameWire

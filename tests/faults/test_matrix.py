@@ -26,8 +26,9 @@ from drivers.instruments.iseg_edcp.device import IsegEDCP
 from drivers.instruments.keyence_lkg import KeyenceLKG
 from drivers.instruments.labjack import PRESETS
 from drivers.instruments.labjack.amplifier import LabJackAmplifier
-from drivers.instruments.labjack.analog_input import AnalogDisplacement, AnalogForce
+from drivers.instruments.labjack.analog_input import AnalogDisplacement, AnalogForce, AnalogMonitor
 from drivers.instruments.optoncdt import OptoNCDT
+from drivers.instruments.scpi import ScpiMeter
 from drivers.instruments.shvps import Shvps
 from drivers.instruments.zaber.device import ZaberStage
 from drivers.links.link import DeviceError, DeviceLost, DeviceRefused, DeviceSilent
@@ -37,6 +38,7 @@ from drivers.roles import (
     HVFlag,
     HVSample,
     HVSupply,
+    MonitorSample,
     Sample,
     SampleFlag,
     StageSample,
@@ -54,7 +56,8 @@ from rig.sim.wire import FrameWire
 FILM = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
 VOLTS = 1000.0
 FAULT_S, AFTER_S = 3.0, 4.0
-ROLE_OF = {one.driver: one.role for one in registered().twins.values()}
+MONITORS_FIRST = sorted(registered().twins.values(), key=lambda one: one.role != "monitor")
+ROLE_OF = {one.driver: one.role for one in MONITORS_FIRST}  # of a driver with several roles the last
 DRIVERS: dict[str, Callable[..., Any]] = {
     "zaber": ZaberStage,
     "gsv8": GSV8,
@@ -67,6 +70,8 @@ DRIVERS: dict[str, Callable[..., Any]] = {
     "labjack-amplifier": LabJackAmplifier,
     "labjack-force": AnalogForce,
     "labjack-displacement": AnalogDisplacement,
+    "labjack-monitor": AnalogMonitor,
+    "scpi": ScpiMeter,
 }
 OPTIONS: dict[str, dict[str, Any]] = {
     "cia404": {"node": 5},
@@ -74,6 +79,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "labjack-amplifier": {"amplifier": PRESETS["trek-610e"], "enable_line": 0},
     "labjack-force": {"newtons_per_V": 0.2},
     "labjack-displacement": {"mm_per_V": 4.0},
+    "labjack-monitor": {"to_si": (1000.0, 0.0), "rate_Hz": 20.0},
+    "scpi": {"to_si": (1000.0, 0.0), "rate_Hz": 20.0, "timeout_s": 0.25},
 }
 QUIET: dict[str, dict[str, Any]] = {
     "zaber": {"start_position_mm": 0.0, "referenced_at_start": True},
@@ -87,8 +94,10 @@ QUIET: dict[str, dict[str, Any]] = {
     "labjack-amplifier": {"input_noise_mV": 0.0},
     "labjack-force": {"input_noise_mV": 0.0, "noise_fraction": 0.0},
     "labjack-displacement": {"input_noise_mV": 0.0, "noise_um": 0.0},
+    "labjack-monitor": {"input_noise_mV": 0.0, "noise": 0.0, "zero_offset": 40.0},
+    "scpi": {"noise": 0.0, "zero_offset": 40.0},
 }
-TOLERANCE = {"stage": 1e-6, "force": 1e-6, "displacement": 1e-6, "hv": 1.5}
+TOLERANCE = {"stage": 1e-6, "force": 1e-6, "displacement": 1e-6, "hv": 1.5, "monitor": 1e-3}
 ROUND_TRIP_S = 0.14  # half of the longest: by so much a sample's time may be off
 
 
@@ -211,6 +220,7 @@ REQUIRED: dict[tuple[str, str], Required] = {
     ("iseg-edcp", "breakdown"): Required(flag=HVFlag.CURRENT_LIMIT),
     ("iseg-edcp", "over_current"): Required(flag=HVFlag.CURRENT_LIMIT),
     ("iseg-edcp", "sag"): AS_IT_IS,
+    ("iseg-edcp", "lies"): AS_IT_IS,  # only a second reading can tell
     ("iseg-edcp", "interlock"): Required(flag=HVFlag.INTERLOCK_OPEN),
     ("iseg-edcp", "inhibit"): Required(flag=HVFlag.INHIBITED),
     ("shvps", "delay"): now_and_then(0.05, ("unexpected_replies",), ("retries",), value=0.15),
@@ -228,9 +238,10 @@ REQUIRED: dict[tuple[str, str], Required] = {
     ("shvps", "breakdown"): AS_IT_IS,
     ("shvps", "over_current"): AS_IT_IS,
     ("shvps", "sag"): AS_IT_IS,
+    ("shvps", "lies"): AS_IT_IS,
     **{
         (driver, kind): required
-        for driver in ("labjack-amplifier", "labjack-force", "labjack-displacement")
+        for driver in ("labjack-amplifier", "labjack-force", "labjack-displacement", "labjack-monitor")
         for kind, required in {
             "delay": now_and_then(0.05, ("unexpected_replies",), ("retries",), value=0.4),
             "split": now_and_then(0.5),
@@ -250,10 +261,22 @@ REQUIRED: dict[tuple[str, str], Required] = {
     ("labjack-amplifier", "breakdown"): AS_IT_IS,
     ("labjack-amplifier", "over_current"): AS_IT_IS,
     ("labjack-amplifier", "sag"): AS_IT_IS,
+    ("labjack-amplifier", "lies"): AS_IT_IS,
+    ("labjack-monitor", "saturate"): Required((("over_range",),), flag=SampleFlag.OVER_RANGE),
+    ("scpi", "delay"): now_and_then(0.05, ("synchronised",), value=0.4),
+    ("scpi", "split"): now_and_then(0.5),
+    ("scpi", "merge"): now_and_then(0.05, ("synchronised",)),
+    ("scpi", "silent"): SILENT,
+    ("scpi", "vanish"): LOST,
+    ("scpi", "reset"): SILENT,
+    ("scpi", "saturate"): Required((("no_value",),), flag=SampleFlag.OVER_RANGE),
+    ("scpi", "freeze"): AS_IT_IS,
+    ("scpi", "wrong_status"): Required((("no_value",),), flag=SampleFlag.NO_VALUE),
 }
 # Where the protocol cannot show it: a frozen value looks like any other, and without a checksum so does a changed
 # digit or bit of a value. How large the part of wrong values may be while one message in five or twenty is damaged.
 BLIND = {
+    **dict.fromkeys((("iseg-edcp", "lies"), ("shvps", "lies"), ("labjack-amplifier", "lies")), 1.0),
     ("zaber", "freeze"): 1.0,
     ("iseg-edcp", "freeze"): 1.0,
     ("shvps", "freeze"): 1.0,
@@ -279,6 +302,8 @@ PLAUSIBLE = {
     "labjack-amplifier": 22e3,
     "labjack-force": 2.2,
     "labjack-displacement": 44e-3,
+    "labjack-monitor": 11e3,
+    "scpi": 11e3,
 }
 
 
@@ -292,6 +317,8 @@ def value_of(sample: Sample) -> float:
             return sample.displacement
         case HVSample():
             return sample.voltage
+        case MonitorSample():
+            return sample.value
 
 
 class Watched:
@@ -355,7 +382,7 @@ class Watched:
         return min(near) - slack <= value_of(sample) <= max(near) + slack
 
 
-CASES = [(one.driver, kind) for one in registered().twins.values() for kind in one.truth.faults()]
+CASES = list(dict.fromkeys((one.driver, kind) for one in registered().twins.values() for kind in one.truth.faults()))
 
 
 @pytest.mark.parametrize(("driver", "kind"), CASES)

@@ -14,12 +14,12 @@ from pydantic import Field, model_validator
 
 from drivers.instrument import Instrument
 from drivers.instruments.labjack.amplifier import Amplifier, LabJackAmplifier
-from drivers.instruments.labjack.analog_input import AnalogDisplacement, AnalogForce
+from drivers.instruments.labjack.analog_input import AnalogDisplacement, AnalogForce, AnalogMonitor
 from drivers.instruments.labjack.codec import LONGEST
 from drivers.instruments.labjack.shared import shared
 from drivers.links.link import ByteLink
 from drivers.recorded import Dialect, Exchange
-from drivers.settings import ForceSettings, Positive, SupplySettings, TcpSettings
+from drivers.settings import ForceSettings, MonitorSettings, Positive, SupplySettings, TcpSettings
 
 DC_SLEW_V_PER_US = 1e-3  # of amplifiers whose data sheet states none: slow enough for any
 
@@ -141,6 +141,15 @@ class AnalogDisplacementSettings(InputSettings):
     rate_Hz: float = Field(default=50.0, gt=0, le=200, description="How often it is read (Hz). Typical: 50.")
 
 
+class AnalogMonitorSettings(MonitorSettings, InputSettings):
+    """A high-voltage probe, a thermometer or a hygrometer on an input of a LabJack; ``factor`` is per volt."""
+
+    driver: Literal["labjack-monitor"] = Field(
+        description="Probe or sensor with a voltage output on a LabJack's input."
+    )
+    ain: int = Field(default=4, ge=0, le=13, description="Analogue input that it is on.")
+
+
 class Frames(Dialect):
     """Requests say how long they are and bear a number, which their answers bear too."""
 
@@ -168,4 +177,5 @@ INSTRUMENTS = (
     Instrument("labjack-amplifier", "hv", AmplifierSettings, LabJackAmplifier, Frames()),
     Instrument("labjack-force", "force", AnalogForceSettings, AnalogForce, Frames()),
     Instrument("labjack-displacement", "displacement", AnalogDisplacementSettings, AnalogDisplacement, Frames()),
+    Instrument("labjack-monitor", "monitor", AnalogMonitorSettings, AnalogMonitor, Frames()),
 )

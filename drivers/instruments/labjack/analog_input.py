@@ -1,4 +1,4 @@
-"""A transducer with a voltage output, a load-cell conditioner or a laser, on an analogue input of a LabJack."""
+"""A transducer with a voltage output, a load-cell conditioner, a laser, a probe, on an input of a LabJack."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Generic, TypeVar
 from drivers.dialogue import LOST_AGAIN_S, Schedule
 from drivers.instruments.labjack.registers import RAIL, Registers, Script
 from drivers.links.link import ByteLink, DeviceError, DeviceLost
-from drivers.roles import OK, DisplacementSample, ForceSample, Identity, SampleFlag
+from drivers.roles import OK, DisplacementSample, ForceSample, Identity, MonitorSample, SampleFlag
+from drivers.settings import Quantity
 
-S = TypeVar("S", ForceSample, DisplacementSample)
+S = TypeVar("S", ForceSample, DisplacementSample, MonitorSample)
 
 
 class AnalogInput(Generic[S]):
@@ -148,3 +149,27 @@ class AnalogDisplacement(AnalogInput[DisplacementSample]):
 
     def _sample(self, t: float, volts: float, flags: SampleFlag) -> DisplacementSample:
         return DisplacementSample(t, volts * self._scale, flags)
+
+
+class AnalogMonitor(AnalogInput[MonitorSample]):
+    """A `drivers.roles.Monitor`: a high-voltage probe, a thermometer. ``to_si`` is (V, K or 1 per volt, at 0 V)."""
+
+    def __init__(
+        self,
+        name: str,
+        link: ByteLink,
+        *,
+        quantity: Quantity = "voltage",
+        to_si: tuple[float, float] = (1000.0, 0.0),
+        ain: int = 4,
+        rate_Hz: float = 5.0,
+        timeout_s: float = 0.25,
+        boot_s: float = 0.0,
+    ) -> None:
+        super().__init__(name, link, ain=ain, rate_Hz=rate_Hz, timeout_s=timeout_s, boot_s=boot_s)
+        self.quantity = quantity
+        self._scale, self._zero = to_si
+        self.settings |= {"si_per_V": f"{self._scale:.9g}", "si_at_zero": f"{self._zero:.9g}"}
+
+    def _sample(self, t: float, volts: float, flags: SampleFlag) -> MonitorSample:
+        return MonitorSample(t, self.name, self.quantity, volts * self._scale + self._zero, flags)

@@ -85,6 +85,11 @@ class Part:
         connection.parts.append(self)
         connection.open += 1
 
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """Of the connection, for another process; empty where it cannot be handed over."""
+        return tuple(getattr(self._connection.link, "descriptors", ()))
+
     def read(self) -> bytes:
         self._connection.take_in()
         data = bytes(self.inbox)

@@ -1,7 +1,7 @@
 """A microcontroller on the simulated bench that prints lines by itself, as an Arduino with an HX711 does.
 
 It shares no code with the driver. It takes nothing in; its value stands in one column of each line, in newtons or
-millimetres, the others count lines.
+millimetres, or what a meter reads; the others count lines.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from rig.sim.truth import Fault, LineTruth, LoadCellTruth, NotNegative, Positive
+from rig.sim.probe import Probe
+from rig.sim.truth import Fault, LineTruth, LoadCellTruth, MonitorTruth, NotNegative, Positive
 from rig.sim.twin import Twin
 from rig.sim.wire import ByteWire
 from rig.sim.world import World
@@ -49,12 +50,22 @@ class PrintedDisplacementTruth(PrinterTruth):
     reboot_s: Positive = Field(default=1.0, description="How long it is silent after power comes back (s).")
 
 
+class PrintedMonitorTruth(PrinterTruth, MonitorTruth):
+    """A meter, thermometer or hygrometer that prints what it reads."""
+
+    driver: Literal["ascii-stream"] = Field(default="ascii-stream", description="Meter that prints lines.")
+    print_rate_Hz: Positive = Field(default=5.0, description="How many lines it sends per second (Hz).")
+    units_per_number: float = Field(default=1.0, description="What a number of 1 that it prints stands for (V, C, %).")
+    clock_drift_ppm: float = Field(default=0.0, description="By how much its clock is too fast (ppm).")
+    reboot_s: Positive = Field(default=1.0, description="How long it is silent after power comes back (s).")
+
+
 class Printer:
     """One board."""
 
     def __init__(
         self,
-        truth: PrintedForceTruth | PrintedDisplacementTruth,
+        truth: PrintedForceTruth | PrintedDisplacementTruth | PrintedMonitorTruth,
         world: World,
         wire: ByteWire,
         rng: np.random.Generator,
@@ -64,6 +75,8 @@ class Printer:
         self._start, self._count = 0.0, 0
         self._frozen: float | None = None
         self._word = ""
+        if isinstance(truth, PrintedMonitorTruth):
+            self._probe = Probe(truth, world, rng)
 
     @property
     def next_time(self) -> float:
@@ -91,7 +104,10 @@ class Printer:
             self._word = "nan" if begins else ""
 
     def _value(self, t: float) -> float:
-        s, noise = self._truth, float(self._rng.standard_normal())
+        s = self._truth
+        if isinstance(s, PrintedMonitorTruth):
+            return self._probe.number(t)
+        noise = float(self._rng.standard_normal())
         if isinstance(s, PrintedForceTruth):
             true = self._world.force_at(max(t - s.lag_ms * 1e-3, 0.0))
             return true * (1.0 + s.gain_error) + s.zero_offset_N + s.noise_fraction * s.full_scale_N * noise
@@ -110,4 +126,5 @@ class Printer:
 TWINS = (
     Twin("ascii-stream", "displacement", PrintedDisplacementTruth, Printer),
     Twin("ascii-stream", "force", PrintedForceTruth, Printer),
+    Twin("ascii-stream", "monitor", PrintedMonitorTruth, Printer),
 )

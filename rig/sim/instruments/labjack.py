@@ -21,8 +21,9 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
+from rig.sim.probe import Probe
 from rig.sim.supply import switch_output
-from rig.sim.truth import Fault, LoadCellTruth, NetworkTruth, NotNegative, OutputTruth, Positive
+from rig.sim.truth import Fault, LoadCellTruth, MonitorTruth, NetworkTruth, NotNegative, OutputTruth, Positive
 from rig.sim.twin import Twin
 from rig.sim.wire import ByteWire
 from rig.sim.world import TICK, World
@@ -327,7 +328,7 @@ class Amplifier:
         self._truth = truth
         self._world = world
         self._rng = rng
-        self.stuck_on = False
+        self.stuck_on = self.lies = False
         self._left = 1.0
         self._frozen: tuple[float, float] | None = None
         self._rail = 0
@@ -412,7 +413,7 @@ class Amplifier:
     def _monitor(self, channel: int, t: float) -> float:
         s = self._truth
         if channel == 0:
-            if s.monitor_unplugged:
+            if s.monitor_unplugged or self.lies:
                 return 0.0
             return math.copysign(self._world.output.at(t)[0], s.gain_V_per_V) / s.monitor_V_per_V
         return math.copysign(1.0, s.gain_V_per_V) * self._world.read_current(t) * 1e6 / s.monitor_uA_per_V
@@ -469,12 +470,21 @@ class AnalogDisplacementTruth(AnalogSensorTruth):
     offset_V: float = Field(default=0.1, description="Output for the flat film (V).")
 
 
+class AnalogMonitorTruth(MonitorTruth, BoxTruth):
+    """A high-voltage probe, a thermometer or a hygrometer with a voltage output, on AIN4."""
+
+    driver: Literal["labjack-monitor"] = Field(
+        default="labjack-monitor", description="Probe or sensor on a LabJack's input."
+    )
+    ain: int = Field(default=4, ge=0, le=13, description="Analogue input that it is on.")
+
+
 class AnalogSensor:
-    """A sensor with a voltage output, and its LabJack: on AIN2 a load cell, on AIN3 a laser."""
+    """A sensor with a voltage output, and its LabJack: on AIN2 a load cell, on AIN3 a laser, on AIN4 a probe."""
 
     def __init__(
         self,
-        truth: AnalogForceTruth | AnalogDisplacementTruth,
+        truth: AnalogForceTruth | AnalogDisplacementTruth | AnalogMonitorTruth,
         world: World,
         wire: ByteWire,
         rng: np.random.Generator,
@@ -485,7 +495,10 @@ class AnalogSensor:
         self._frozen: float | None = None
         self._rail = 0
         self.box = box_of(truth, world)
-        self.box.inputs[2 if isinstance(truth, AnalogForceTruth) else 3] = self._input
+        channel = 2 if isinstance(truth, AnalogForceTruth) else 3
+        if isinstance(truth, AnalogMonitorTruth):
+            channel, self._probe = truth.ain, Probe(truth, world, rng)
+        self.box.inputs[channel] = self._input
         self._server = Server(self.box, wire)
 
     @property
@@ -524,6 +537,8 @@ class AnalogSensor:
 
     def _volts(self, t: float) -> float:
         s = self._truth
+        if isinstance(s, AnalogMonitorTruth):
+            return self._probe.number(t)
         if isinstance(s, AnalogForceTruth):
             true = self._world.force_at(t - s.lag_ms * 1e-3) / s.full_scale_N * (1.0 + s.gain_error)
             noise, offset = s.noise_fraction, s.zero_offset_V
@@ -545,4 +560,5 @@ TWINS = (
     Twin("labjack-amplifier", "hv", AmplifierTruth, Amplifier),
     Twin("labjack-force", "force", AnalogForceTruth, AnalogSensor),
     Twin("labjack-displacement", "displacement", AnalogDisplacementTruth, AnalogSensor),
+    Twin("labjack-monitor", "monitor", AnalogMonitorTruth, AnalogSensor),
 )

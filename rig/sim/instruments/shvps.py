@@ -77,7 +77,7 @@ class Shvps:
         self._wire = wire
         self._noise = ConversionNoise(rng, settings.reading_period_s)
         self._line = bytearray()
-        self.stuck_on = False
+        self.stuck_on = self.lies = False
         self.wrong_mode: int | None = None
         self._left = 1.0
         self._frozen: int | None = None
@@ -177,6 +177,8 @@ class Shvps:
 
     def _reading(self, t: float) -> int:
         """Measured voltage in whole volts, never negative."""
+        if self.lies:
+            return 0
         if self._frozen is not None:
             return self._frozen
         true = self._world.output.at(t)[0] / (1.0 + self._settings.gain_error)
@@ -227,7 +229,8 @@ class Shvps:
             case "Vnow":
                 return str(self._reading(t))
             case "SwMode":
-                return str(self._mode if self.wrong_mode is None else self.wrong_mode)
+                shown = OFF if self.lies else self._mode
+                return str(shown if self.wrong_mode is None else self.wrong_mode)
             case "F":
                 return f"{self._frequency:.3f}"
             case "Cycle":

@@ -23,6 +23,10 @@ SAMPLES: dict[str, dict[str, Any]] = {
     },
     "/force/sample": {"reading": -0.0, "force_N": 0.1, "flags": 4},
     "/displacement/sample": {"reading_m": 0.0, "displacement_m": 5e-324, "flags": 0},
+    **{
+        f"/{name}/sample": {"voltage_V": 0.5, "temperature_K": 296.1, "relative_humidity": 0.4, "flags": 1}
+        for name in ("monitor", "monitor_2", "monitor_3")
+    },
     "/hv/sample": {"voltage_V": 1499.75, "current_A": 1e-9, "setpoint_V": 1500.0, "flags": 1023},
     "/target": {"displacement_m": 2e-3, "voltage_V": 1500.0, "speed_m_per_s": 1e-4},
     "/phase": {

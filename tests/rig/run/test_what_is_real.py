@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 from rig.analysis.film import _check_one_kind
 from rig.base.clock import RealClock
 from rig.base.errors import ConfigError, DataError
-from rig.base.served import Announcement, _began, are_served
+from rig.base.served import Announcement, _began, are_served, tcp_port
 from rig.cli.app import main
 from rig.log.contents import IN_MEMORY, ON_PORTS, ON_SERVED_PORTS
 from rig.protocol.experiment import SERVED_BY, SERVER, Experiment, prepare
@@ -113,6 +113,22 @@ def test_a_served_bench_says_which_terminals_are_its_own(own_directory: Path) ->
     assert are_served(map(str, names)) and not are_served(["/dev/null"])
     server.close()
     assert not are_served(map(str, names)) and not list(own_directory.glob("served-*"))
+
+
+def test_a_served_bench_says_which_tcp_ports_are_its_own(own_directory: Path) -> None:
+    """It counts only while that very process listens there, on this machine alone."""
+    settings = SimulationSettings.model_validate({"seed": 1, "monitor": {"driver": "scpi"}})
+    server = Server(SimulatedBench(settings, load_scene(SCENE)[0].specimen.specimen(), {"monitor"}), RealClock())
+    name = tcp_port(int(server.ports["monitor"]["tcp_port"]))
+    assert are_served([name]) and not are_served([tcp_port(9)])
+    file = next(own_directory.glob("served-*"))
+    said = json.loads(file.read_text())
+    file.write_text(json.dumps(said | {"ports": [tcp_port(9), name]}))
+    assert are_served([name])
+    if Path("/proc/net/tcp").exists():
+        assert not are_served([tcp_port(9)])  # nobody listens there, whatever the file says
+    server.close()
+    assert not are_served([name])
 
 
 def invoke(tmp_path: Path, scene: Path, *options: str) -> Result:

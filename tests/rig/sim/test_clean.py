@@ -28,6 +28,7 @@ MORE_KEYS: dict[str, dict[str, Any]] = {
     "labjack-amplifier": {"preset": "trek-610e"},
     "labjack-force": {"newtons_per_V": 1.0},
     "labjack-displacement": {"mm_per_V": 1.0},
+    **{key: {"quantity": "voltage", "rate_Hz": 10.0} for key in ("scpi", "labjack-monitor")},
 }
 
 

@@ -369,8 +369,10 @@ PROBE = {
     "gsv8": b"",
     "ascii-stream": b"",
     "optoncdt-1420": b"",
+    "scpi": b"*IDN?\n",
     **dict.fromkeys(
-        ("labjack-amplifier", "labjack-force", "labjack-displacement"), bytes.fromhex("000100000006010300000002")
+        ("labjack-amplifier", "labjack-force", "labjack-displacement", "labjack-monitor"),
+        bytes.fromhex("000100000006010300000002"),
     ),
 }
 TWINS_BY_DRIVER = {one.driver: (one.role, one.truth) for one in registered().twins.values()}

@@ -11,16 +11,51 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
+from rig.sim.instruments.iseg.words import (
+    ARC,
+    BLOCKING,
+    CONSTANT_I,
+    CONSTANT_V,
+    DISABLED,
+    DO_CLEAR,
+    EMERGENCY,
+    END_OF_RAMP,
+    EVENT_ACTIVE,
+    FINE,
+    FLAG_ONLY,
+    HV_ON,
+    I_BOUNDS,
+    INHIBIT,
+    INPUT_ERROR,
+    KILL,
+    LIMIT_GOOD,
+    MODULE_GOOD,
+    MODULE_INPUT_ERROR,
+    MODULE_OFF,
+    NO_RAMP,
+    NO_SUM_ERROR,
+    OFF_AT_ONCE,
+    OFF_WITH_RAMP,
+    ON,
+    ON_TO_OFF,
+    RAMPING,
+    SAFETY_LOOP,
+    SET_FINE,
+    SET_KILL,
+    SUPPLY,
+    TEMPERATURE,
+    TRIP,
+    V_BOUNDS,
+    Channel,
+)
 from rig.sim.noise import ConversionNoise
 from rig.sim.supply import switch_output
 from rig.sim.truth import IN_REACH, ONE_PIECE, BusTruth, Fault, NotNegative, OutputTruth, Positive
-from rig.sim.twin import Twin
 from rig.sim.wire import Frame, FrameWire
 from rig.sim.world import TICK, World
 
@@ -28,43 +63,6 @@ ANSWER_S = 0.5e-3
 ADC_S = 0.02
 QUIET_S = 60.0
 MODULE_CLASS = 0x14  # type byte of the log-on frame
-
-# Module status
-KILL, TEMPERATURE, SUPPLY, MODULE_GOOD, EVENT_ACTIVE, SAFETY_LOOP = 1 << 15, 1 << 14, 1 << 13, 1 << 12, 1 << 11, 1 << 10
-NO_RAMP, NO_SUM_ERROR, MODULE_INPUT_ERROR, LIMIT_GOOD, HV_ON, FINE = 1 << 9, 1 << 8, 1 << 6, 1 << 5, 1 << 3, 1 << 0
-# Module control
-SET_KILL, SET_FINE, DO_CLEAR = 1 << 14, 1 << 12, 1 << 6
-# Channel status and event status share their bits
-V_LIMIT, I_LIMIT, TRIP, INHIBIT, V_BOUNDS, I_BOUNDS = 1 << 15, 1 << 14, 1 << 13, 1 << 12, 1 << 11, 1 << 10
-CONSTANT_V, CONSTANT_I, EMERGENCY, ON, INPUT_ERROR, ARC = 1 << 7, 1 << 6, 1 << 5, 1 << 3, 1 << 2, 1 << 1
-RAMPING = 1 << 4  # status
-END_OF_RAMP = 1 << 4  # event
-ON_TO_OFF = 1 << 3  # event
-BLOCKING = V_LIMIT | I_LIMIT | TRIP | INHIBIT | EMERGENCY
-
-# Trip actions
-FLAG_ONLY, OFF_WITH_RAMP, OFF_AT_ONCE, MODULE_OFF, DISABLED = range(5)
-
-
-@dataclass
-class _Channel:
-    """What one channel remembers. Only channel 0 has the specimen on its output; the others drive nothing."""
-
-    setpoint: float = 0.0
-    current_limit: float = 0.0
-    v_bounds: float = 0.0
-    i_bounds: float = 0.0
-    control: int = 0
-    on: bool = False
-    emergency: bool = False
-    event: int = 0
-    mask: int = BLOCKING  # an event blocks only if its bit is set here too
-    trip_delay_ms: int = 0
-    trip_action: int = DISABLED
-    latched: int = 0  # status bits that stay until their event is cleared
-    over_since: float = math.inf
-    ramping: bool = False
-    limiting: bool = False
 
 
 class IsegTruth(OutputTruth, BusTruth):
@@ -98,9 +96,10 @@ class IsegEDCP:
 
     Attributes
     ----------
-    stuck_on, sag, wrong_status, interlock_open, inhibited : faults
-        The output ignores every way of switching off; the part of the voltage that is left; bits inverted in the
-        channel status; the safety loop is open; the external inhibit is active.
+    stuck_on, lies, sag, wrong_status, interlock_open, inhibited : faults
+        The output ignores every way of switching off; it is reported off and 0 V whatever is true; the part of the
+        voltage that is left; bits inverted in the channel status; the safety loop is open; the external inhibit is
+        active.
     before_reply : callable or None
         A fault: called with the time before each answer is sent.
     """
@@ -115,7 +114,7 @@ class IsegEDCP:
         self.nominal_v = settings.nominal_voltage_V
         self._sign = -1.0 if settings.negative else 1.0
         self.nominal_i = settings.nominal_current_mA * 1e-3
-        self.stuck_on = False
+        self.stuck_on = self.lies = False
         self.sag = 1.0
         self.wrong_status = 0
         self.before_reply: Callable[[float], None] | None = None
@@ -139,7 +138,7 @@ class IsegEDCP:
 
     def _power_up(self, t: float) -> None:
         limit = self.nominal_i * self._settings.current_limit_percent / 100
-        self._channels = [_Channel(current_limit=limit) for _ in range(self._settings.channels)]
+        self._channels = [Channel(current_limit=limit) for _ in range(self._settings.channels)]
         self._ramp_percent = self._settings.ramp_percent_per_s
         self._kill = False
         self._fine = False
@@ -215,7 +214,7 @@ class IsegEDCP:
     def _rate(self) -> float:
         return self._ramp_percent / 100 * self.nominal_v
 
-    def _drive(self, channel: _Channel, t: float) -> None:
+    def _drive(self, channel: Channel, t: float) -> None:
         """Ramp the output to where it now should go."""
         target = channel.setpoint if channel.on else 0.0
         channel.ramping = True
@@ -230,7 +229,7 @@ class IsegEDCP:
         if voltage > 0 and not self.stuck_on:
             self._world.output.ramp(t, 0.0, voltage / fall_time)
 
-    def _off_at_once(self, channel: _Channel, t: float) -> None:
+    def _off_at_once(self, channel: Channel, t: float) -> None:
         if channel.on:
             channel.event |= ON_TO_OFF
         channel.on = channel.ramping = channel.limiting = False
@@ -238,7 +237,7 @@ class IsegEDCP:
         if channel is self._channels[0]:
             self._cut(t, self._settings.fall_time_s)
 
-    def _off_with_ramp(self, channel: _Channel, t: float) -> None:
+    def _off_with_ramp(self, channel: Channel, t: float) -> None:
         if channel.on:
             channel.event |= ON_TO_OFF
             channel.on = channel.limiting = False
@@ -297,11 +296,11 @@ class IsegEDCP:
         if channel.i_bounds and current > channel.i_bounds:
             channel.event |= I_BOUNDS
 
-    def _needed(self, channel: _Channel) -> float:
+    def _needed(self, channel: Channel) -> float:
         """Current (A) that the set-point would draw when standing."""
         return channel.setpoint / self._world.film_resistance + self._world.extra_leakage
 
-    def _over_current(self, channel: _Channel, voltage: float, t: float) -> None:
+    def _over_current(self, channel: Channel, voltage: float, t: float) -> None:
         """More current than set: trip, or hold the current."""
         waited = t - channel.over_since >= channel.trip_delay_ms * 1e-3
         if self._kill or (waited and channel.trip_action in (OFF_AT_ONCE, MODULE_OFF)):
@@ -329,16 +328,16 @@ class IsegEDCP:
     def _measured_v(self, t: float) -> float:
         if self._frozen is not None:
             return self._frozen[0]
-        true = self._world.output.at(t)[0] / (1.0 + self._settings.gain_error)
+        true = 0.0 if self.lies else self._world.output.at(t)[0] / (1.0 + self._settings.gain_error)
         return true + self._settings.voltage_noise_V * self._v_noise.at(t)
 
     def _measured_i(self, t: float) -> float:
         if self._frozen is not None:
             return self._frozen[1]
-        current = min(max(self._world.read_current(t), 0.0), 1.2 * self.nominal_i)
+        current = 0.0 if self.lies else min(max(self._world.read_current(t), 0.0), 1.2 * self.nominal_i)
         return current + self._settings.current_noise_nA * 1e-9 * self._i_noise.at(t)
 
-    def _channel_status(self, channel: _Channel) -> int:
+    def _channel_status(self, channel: Channel) -> int:
         status = channel.latched
         if channel.on:
             status |= ON | (CONSTANT_I if channel.limiting else CONSTANT_V)
@@ -354,6 +353,8 @@ class IsegEDCP:
             status |= ARC
         if channel is self._channels[0]:
             status ^= self.wrong_status
+            if self.lies:
+                status &= ~(ON | RAMPING | CONSTANT_V | CONSTANT_I)
         return status
 
     def _module_status(self) -> int:
@@ -448,7 +449,7 @@ class IsegEDCP:
         }
         return struct.pack(*values[opcode]) if opcode in values else None
 
-    def _channel_value(self, opcode: int, channel: _Channel, t: float) -> bytes | None:
+    def _channel_value(self, opcode: int, channel: Channel, t: float) -> bytes | None:
         first = channel is self._channels[0]
         if opcode == 0x4102:  # a measurement is made when it is asked for
             return struct.pack(">f", self._sign * self._measured_v(t) if first else 0.0)
@@ -518,7 +519,7 @@ class IsegEDCP:
         for channel in self._channels:
             self._clear_event(channel, 0xFFFF)
 
-    def _clear_event(self, channel: _Channel, word: int) -> None:
+    def _clear_event(self, channel: Channel, word: int) -> None:
         channel.event &= ~word
         channel.latched &= ~word
         if channel.emergency:
@@ -528,7 +529,7 @@ class IsegEDCP:
         if not any(c.event & INPUT_ERROR for c in self._channels):
             self._input_error = False
 
-    def _write_channel(self, opcode: int, channel: _Channel, value: bytes, t: float) -> bool:
+    def _write_channel(self, opcode: int, channel: Channel, value: bytes, t: float) -> bool:
         if opcode in (0x4001, 0x4002, 0x4003, 0x4005) and len(value) == 2:
             (word,) = struct.unpack(">H", value)
             if opcode == 0x4001:
@@ -552,7 +553,7 @@ class IsegEDCP:
             return self._write_quantity(opcode, channel, number, t)
         return False
 
-    def _write_quantity(self, opcode: int, channel: _Channel, number: float, t: float) -> bool:
+    def _write_quantity(self, opcode: int, channel: Channel, number: float, t: float) -> bool:
         v_top = self.nominal_v * self._settings.voltage_limit_percent / 100
         i_top = self.nominal_i * self._settings.current_limit_percent / 100
         top = v_top if opcode in (0x4100, 0x4104) else i_top
@@ -572,7 +573,7 @@ class IsegEDCP:
                 channel.i_bounds = number
         return True
 
-    def _set_control(self, channel: _Channel, word: int, t: float) -> None:
+    def _set_control(self, channel: Channel, word: int, t: float) -> None:
         was_emergency = channel.emergency
         channel.emergency = bool(word & EMERGENCY)
         channel.control = word  # bits that mean nothing here are kept as they were written
@@ -595,6 +596,3 @@ class IsegEDCP:
                 self._drive(channel, t)
         elif channel.on:
             self._off_with_ramp(channel, t)
-
-
-TWINS = (Twin(driver="iseg-edcp", role="hv", truth=IsegTruth, make=IsegEDCP),)
