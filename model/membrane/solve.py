@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import Array
 from model.material.law import Evaluations, Film, stack, stress
 from model.material.materials import EPSILON_0
-from model.membrane import from_rest, ritz, scalar, tension_field
+from model.membrane import compiled, from_rest, ritz, scalar, tension_field
 from model.membrane.flat import Flat, Solved
 from model.membrane.profile import Profile, dense, profile
 from model.membrane.refinement import ROUND_OFF_TENSION, Answer, Start, groups, prolonged, refine
@@ -56,7 +56,7 @@ class Solution:
     dforce: dict[str, Any] | None = None
     evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
     kept: Solved | None = field(default=None, repr=False, compare=False)
-    quick: Found | None = field(default=None, repr=False, compare=False)
+    quick: Found | compiled.One | None = field(default=None, repr=False, compare=False)
 
     @property
     def answered(self) -> bool:
@@ -148,9 +148,9 @@ class _Inputs:
         sign = np.where(self.h[index] < 0.0, -1.0, 1.0)[:, None]
         return replace(found, z=sign * found.z, slope=sign * found.slope)
 
-    def blocks(self) -> Iterator[NDArray[np.intp]]:
+    def blocks(self, wanted: NDArray[np.bool_]) -> Iterator[NDArray[np.intp]]:
         """States to solve together: with or without voltage, of like spans, and as many as stay in the cache."""
-        index = np.flatnonzero(np.isfinite(self.h) & np.isfinite(self.voltage))
+        index = np.flatnonzero(np.isfinite(self.h) & np.isfinite(self.voltage) & wanted)
         charged = self.voltage[index] != 0.0
         groups = [index] if charged.all() or not charged.any() else [index[~charged], index[charged]]
         of_film = np.log([s.ring_radius / s.disk_radius for s in self.specimens])
@@ -284,6 +284,24 @@ def _quick(
     )
 
 
+def _compiled(specimen: Specimen, h: float, voltage: float, one: compiled.One, sensitivities: bool) -> Solution:
+    """What the kernel has found."""
+    m, found = specimen.material, one.answer
+    return Solution(
+        specimen=specimen,
+        h=h,
+        voltage=voltage,
+        **{name: getattr(found, name) for name in compiled.NUMBERS},
+        status=Status(found.status),
+        stable=True,
+        field_exceeded=m.breakdown_field is not None and found.peak_field > m.breakdown_field,
+        stretch_exceeded=m.max_stretch is not None and found.max_stretch > m.max_stretch,
+        dforce=one.dforce(m) if sensitivities else None,
+        evaluations=Evaluations(found.mechanical, found.electric),
+        quick=one,
+    )
+
+
 def _on_branch(specimen: Specimen, h: float, voltage: float, found: Found, count: Evaluations) -> bool:
     """Whether an easy taut state is plainly on the branch from rest; see `_Block.doubtful`."""
     if found.cones:
@@ -307,8 +325,13 @@ def _solve(
         keep,
     )
     count = Evaluations()
+    wanted = np.ones(len(inputs.h), dtype=np.bool_)
+    if not keep:
+        inputs_of = inputs.specimens, inputs.which, inputs.h, inputs.voltage
+        relaxed = wrinkling == "tension_field"
+        wanted = compiled.solve_states(result, count, *inputs_of, tolerance=tolerance, relaxed=relaxed)
     with np.errstate(all="ignore"):
-        for index in inputs.blocks():
+        for index in inputs.blocks(wanted):
             _Block(inputs, index, count).solve(result, tolerance, wrinkling, sensitivities)
     return result.solutions(inputs.shape, count), result.kept
 
@@ -328,9 +351,15 @@ def solve(
     ``near``, the solution of a like state, shortens the way to a taut one; the answer does not depend on it.
     """
     _check(tolerance, wrinkling)
+    folds = wrinkling == "tension_field"
+    one = compiled.solve_one(
+        specimen, float(h), float(voltage), tolerance=tolerance, relaxed=folds, sensitivities=sensitivities
+    )
+    if one is not None:
+        return _compiled(specimen, float(h), float(voltage), one, sensitivities)
     if not sensitivities:
-        folds = wrinkling == "tension_field"
-        quick = _quick(specimen, float(h), float(voltage), tolerance, folds, near.quick if near else None)
+        begin = near.quick if near is not None and isinstance(near.quick, Found) else None
+        quick = _quick(specimen, float(h), float(voltage), tolerance, folds, begin)
         if quick is not None:
             return quick
     inputs = _Inputs.gather(specimen, float(h), float(voltage))

@@ -1,0 +1,184 @@
+/* The membrane's equilibrium, many states after one another: the kernel of model/membrane/solve.py.
+
+   It treats one-element films that stay taut, on the branch that a cold start finds without doubt; every other state is
+   left to the methods for arrays (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so
+   that nothing depends on the others. */
+#include "output.h"
+
+#ifdef _WIN32
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+
+#define TWO_PI 6.28318530717958647693
+#define SOFTENING 0.35
+#define FLAT_HEIGHT 1e-9 /* h/b at which the limit of the flat film is solved */
+
+/* A film in SI units: _Film of model/membrane/compiled.py. */
+typedef struct {
+    double disk_radius, ring_radius, thickness, prestretch, shear_modulus, eps_r, permittivity;
+    Law law;
+} Film;
+
+/* Derivatives of the force in SI units. */
+typedef struct {
+    double h, voltage, disk_radius, ring_radius, thickness, prestretch, eps_r;
+    double mu[MOST_PARAMETERS], alpha[MOST_PARAMETERS];
+} Slopes;
+
+/* What is found of a state, in SI units: _Answer of model/membrane/compiled.py. */
+typedef struct {
+    double force, peak_field, peak_field_radius, min_hoop_stress, min_meridional_stress, max_stretch, error_estimate;
+    double lam; /* the force over its unit */
+    int64_t status, iterations, modes, mechanical, electric;
+    Slopes dforce;
+} Answer;
+
+/* What all states of a call share: _Task of model/membrane/compiled.py. */
+typedef struct {
+    const Table *tables[MOST_MODES + 1]; /* one of so many modes at that place, or none */
+    int64_t first_modes[3];              /* to begin with, for films up to the spans 2.4, 3.1 and 4 */
+    int64_t relaxed, sensitivities;
+    double tolerance;
+} Task;
+
+static int is_positive(double x) { return x > 0.0 && x < INFINITY; }
+
+static int is_film(const Film *film) {
+    const Law *law = &film->law;
+    if (law->kind < 0 || law->kind >= LAWS) return 0;
+    if (law->moduli < 1 || law->moduli > MOST_PARAMETERS || law->shapes < 0 || law->shapes > MOST_PARAMETERS) return 0;
+    if (law->kind == OGDEN && law->shapes != law->moduli) return 0;
+    for (int64_t k = 0; k < law->moduli; k++)
+        if (!(fabs(law->mu[k]) < INFINITY)) return 0;
+    for (int64_t k = 0; k < law->shapes; k++)
+        if (!(fabs(law->alpha[k]) < INFINITY)) return 0;
+    return is_positive(film->disk_radius) && film->disk_radius < film->ring_radius && is_positive(film->ring_radius) &&
+           is_positive(film->thickness) && is_positive(film->prestretch) && is_positive(film->shear_modulus) &&
+           is_positive(film->eps_r) && is_positive(film->permittivity);
+}
+
+/* The state in dimensionless form. */
+static void pose(const Film *film, double h, double voltage, Problem *problem) {
+    double field = voltage / film->thickness;
+    problem->law = film->law;
+    for (int64_t k = 0; k < film->law.moduli; k++) problem->law.mu[k] = film->law.mu[k] / film->shear_modulus;
+    problem->field = film->permittivity * (field * field) / film->shear_modulus;
+    problem->log_prestretch = log_of(film->prestretch);
+    problem->span = log_of(film->ring_radius / film->disk_radius);
+    problem->height = h == 0.0 ? FLAT_HEIGHT : fabs(h) / film->ring_radius;
+    problem->mechanical = problem->electric = 0;
+}
+
+/* Whether the film, stretched like a straight cone both ways, would push outwards: no tension can hold it. */
+static int is_slack(Problem *problem) {
+    double cone = problem->height / -expm1_of(-problem->span);
+    double log = problem->log_prestretch + 0.5 * log1p_of(cone * cone);
+    Stress law;
+    if (problem->field == 0.0) return 0;
+    stress_at(problem, log, log, &law);
+    return !(law.t1[0] >= 0.0);
+}
+
+/* The answer in SI units. */
+static void place(const Film *film, const Problem *problem, double h, double voltage, const Extremes *x, Answer *out) {
+    double sign = h > 0.0 ? 1.0 : h < 0.0 ? -1.0 : 0.0;
+    double b = film->ring_radius, t = film->thickness, lp = film->prestretch, shear = film->shear_modulus;
+    out->force = TWO_PI * b * t * shear / (lp * lp) * out->lam * sign;
+    out->peak_field = fabs(voltage) / t * exp_of(x->log_area);
+    out->peak_field_radius = x->radius * b;
+    out->min_hoop_stress = shear * x->hoop;
+    out->min_meridional_stress = shear * x->meridional;
+    out->max_stretch = exp_of(x->log_stretch);
+    out->mechanical = problem->mechanical;
+    out->electric = problem->electric;
+}
+
+/* The derivatives in SI units. */
+static void place_slopes(const Film *film, double h, double voltage, const Derivatives *d, Answer *out) {
+    double sign = h > 0.0 ? 1.0 : h < 0.0 ? -1.0 : 0.0;
+    double a = film->disk_radius, b = film->ring_radius, t = film->thickness;
+    double lp = film->prestretch, shear = film->shear_modulus, force = out->force;
+    double unit = TWO_PI * t * shear / (lp * lp), scale = b * unit * sign;
+    Slopes *f = &out->dforce;
+    f->h = unit * d->height;
+    f->prestretch = (scale * d->log_prestretch - 2.0 * force) / lp;
+    f->eps_r = scale * d->log_field / film->eps_r;
+    f->voltage = voltage != 0.0 ? 2.0 * scale * d->log_field / voltage : 0.0;
+    f->thickness = (force - 2.0 * scale * d->log_field) / t;
+    f->disk_radius = -scale * d->span / a;
+    f->ring_radius = (force - h * f->h + scale * d->span) / b;
+    for (int64_t k = 0; k < film->law.moduli; k++) f->mu[k] = scale / shear * d->mu[k];
+    for (int64_t k = 0; k < film->law.shapes; k++) f->alpha[k] = scale * d->alpha[k];
+}
+
+/* One state. Returns its status; `out` has numbers where that is TAUT or WRINKLED. */
+static int64_t answer(const Task *task, const Film *film, double h, double voltage, Answer *out, State *state) {
+    Problem problem;
+    Grid grid;
+    Iterate found;
+    Points at;
+    Extremes x;
+    if (!is_film(film) || !(fabs(h) < INFINITY) || !(fabs(voltage) < INFINITY)) return LEFT_TO_OTHERS;
+    pose(film, h, voltage, &problem);
+    if (!(problem.span > 0.0 && problem.span <= LONGEST) || !is_positive(problem.height) || is_slack(&problem))
+        return LEFT_TO_OTHERS;
+    int64_t first = task->first_modes[problem.span <= 2.4 ? 0 : problem.span <= 3.1 ? 1 : 2];
+    int status = refine(&problem, task->tables, first, task->tolerance, task->relaxed != 0, &grid, state, &found,
+                        &out->error_estimate);
+    if (status != TAUT) return status;
+    evaluate(&problem, &grid, state, &at);
+    extremes(&problem, &grid, &at, found.lam, &x);
+    if (!(x.meridional > 0.0) || !(x.softening <= SOFTENING)) return LEFT_TO_OTHERS;
+    int wrinkled = !(x.hoop >= ROUND_OFF_TENSION * x.meridional);
+    if (wrinkled && task->relaxed) return LEFT_TO_OTHERS;
+    out->lam = found.lam;
+    out->iterations = found.steps;
+    out->modes = grid.table->modes;
+    place(film, &problem, h, voltage, &x, out);
+    if (task->sensitivities) {
+        Reduced system;
+        Step by_height;
+        Derivatives d;
+        reduce(&grid, state->w, &at, &system);
+        factor(grid.table->modes, &system);
+        tangent(&grid, &system, &by_height);
+        derivatives(&problem, &grid, state, &at, found.lam, &by_height, &d);
+        place_slopes(film, h, voltage, &d, out);
+    }
+    return wrinkled ? WRINKLED : TAUT;
+}
+
+static int is_task(const Task *task) {
+    for (int64_t modes = 0; modes <= MOST_MODES; modes++) {
+        const Table *table = task->tables[modes];
+        if (table && (modes < 2 || table->modes != modes || table->points != modes + 3 || table->next <= modes)) return 0;
+    }
+    for (int64_t k = 0; k < 3; k++)
+        if (task->first_modes[k] < 2 || task->first_modes[k] > MOST_MODES) return 0;
+    return task->tolerance >= 1e-12 && task->tolerance <= 1e-2;
+}
+
+/* Solve the states (films[which[s]], h[s], voltage[s]), in SI units; `kept` takes their unknowns, or is NULL. Returns how
+   many states have no answer here, or -1 where the task itself makes no sense. */
+EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t film_count, const int64_t *which,
+                                int64_t states, const double *h, const double *voltage, Answer *answers, State *kept) {
+    int64_t left = 0;
+    if (!is_task(task)) return -1;
+    for (int64_t s = 0; s < states; s++) {
+        State state;
+        Answer *out = &answers[s];
+        out->status = LEFT_TO_OTHERS;
+        if (which[s] >= 0 && which[s] < film_count)
+            out->status = answer(task, &films[which[s]], h[s], voltage[s], out, kept ? &kept[s] : &state);
+        if (out->status < 0) left++;
+    }
+    return left;
+}
+
+/* exp, expm1, log, log1p of n numbers, for tests. */
+EXPORT void dea_kernel_elementary(int64_t kind, int64_t n, const double *x, double *out) {
+    for (int64_t i = 0; i < n; i++)
+        out[i] = kind == 0 ? exp_of(x[i]) : kind == 1 ? expm1_of(x[i]) : kind == 2 ? log_of(x[i]) : log1p_of(x[i]);
+}

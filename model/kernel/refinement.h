@@ -1,0 +1,149 @@
+/* Newton at increasing resolution: model/membrane/refinement.py for one taut state, with the same steps, limits and
+   error estimate. */
+#ifndef DEA_REFINEMENT_H
+#define DEA_REFINEMENT_H
+
+#include "ritz.h"
+
+enum { MOST_STEPS = 25 };
+#define NEWTON_FACTOR 0.3
+#define LEVEL_FACTOR 0.5
+#define ROUND_OFF 1e-13
+#define LEAST_SHARE 0.05
+#define CLEARLY_NEGATIVE (-1e-2)
+#define ROUND_OFF_TENSION (-1e-9)
+#define LONGEST 4.0
+
+/* What a state came to; the first two are numbers of model.membrane.solution.Status. */
+enum { TAUT = 0, WRINKLED = 1, LEFT_TO_OTHERS = -1, NEEDS_TABLE = -2 };
+
+/* A state after Newton at one resolution. */
+typedef struct {
+    double lam;
+    double change; /* largest relative change of a slope in the last step */
+    double tail;   /* share of the energy that the last modes carry */
+    double hoop;   /* least hoop over largest meridional stress at the points, before the last step */
+    int64_t steps;
+    int ok;
+} Iterate;
+
+static double larger(double x, double y) { return x > y ? x : y; }
+static double smaller(double x, double y) { return x < y ? x : y; }
+
+/* Change of a slope at which Newton's error is just below the tolerance. */
+static double goal(double tolerance) {
+    return smaller(0.03, larger(1e-6, sqrt(0.9 * tolerance / NEWTON_FACTOR)));
+}
+
+/* Estimated relative error of `now`, after the force `previous` at the resolution before. */
+static double estimate(const Iterate *now, double previous, double tolerance) {
+    double refined = LEVEL_FACTOR * fabs((now->lam - previous) / now->lam);
+    return refined + NEWTON_FACTOR * (now->change * now->change) + now->tail + (ROUND_OFF + LEAST_SHARE * tolerance);
+}
+
+/* Add a step to the state, shortened where a slope would change beyond reason. Returns the largest relative change,
+   which counts for more where the tension is a small rest of elastic and Maxwell stress; NaN where there is none. */
+static double advance(const Grid *grid, const Points *at, const Step *step, int charged, State *state) {
+    int64_t points = grid->table->points, modes = grid->table->modes;
+    double change = 0.0, share = 1.0, sum = step->lam;
+    for (int64_t i = 0; i < points; i++) {
+        change = larger(change, fabs(step->dw[i] / state->w[i]));
+        sum += step->dw[i];
+    }
+    if (!(fabs(sum) < INFINITY)) return NAN;
+    if (charged) {
+        for (int64_t i = 0; i < points; i++) share = larger(share, fabs(at->law.maxwell[i] / at->law.t1[i]));
+        change *= sqrt(share);
+    }
+    double part = change > 2.0 ? 2.0 / change : 1.0;
+    for (int64_t i = 0; i < points; i++) {
+        double w = state->w[i], moved = w + part * step->dw[i];
+        state->w[i] = change > 0.8 && !(moved > 0.2 * w) ? 0.2 * w : moved;
+    }
+    for (int64_t k = 0; k < modes; k++) state->c[k] += part * step->dc[k];
+    return change;
+}
+
+/* Energy of the last mode and a tenth of that of the last but one, over F h. */
+static double tail(const Problem *problem, const Grid *grid, const State *state, const Reduced *system, double lam) {
+    int64_t k = grid->table->modes - 1;
+    double last = state->c[k] * state->c[k] * system->diagonal[k];
+    double fore = state->c[k - 1] * state->c[k - 1] * system->diagonal[k - 1];
+    return 0.5 * (last + 0.1 * fore) / (lam * problem->height);
+}
+
+static double hoop_share(int64_t n, const Stress *law) {
+    double least = INFINITY, most = -INFINITY;
+    for (int64_t i = 0; i < n; i++) {
+        least = smaller(least, law->t2[i]);
+        most = larger(most, law->t1[i]);
+    }
+    return least / most;
+}
+
+/* Newton from `state` until the slopes change by less than `aim`; the error is then its square. */
+static Iterate newton(Problem *problem, const Grid *grid, State *state, double aim, int64_t limit) {
+    Points at;
+    Reduced system;
+    Step step;
+    Iterate found = {NAN, NAN, NAN, NAN, 0, 0};
+    while (found.steps < limit) {
+        evaluate(problem, grid, state, &at);
+        newton_step(problem, grid, state->w, &at, &system, &step);
+        found.steps++;
+        found.change = advance(grid, &at, &step, problem->field != 0.0, state);
+        if (found.change <= aim) {
+            found.lam = step.lam;
+            found.tail = tail(problem, grid, state, &system, step.lam);
+            found.hoop = hoop_share(grid->table->points, &at.law);
+            found.ok = step.stable && step.lam > 0.0;
+            break;
+        }
+        if (!(found.change < INFINITY)) break;
+    }
+    return found;
+}
+
+/* Values at the points carried to others by `matrix`, (to, from). */
+static void carried(int64_t to, int64_t from, const double *matrix, double *values) {
+    double old[MOST_POINTS];
+    memcpy(old, values, sizeof(double) * (size_t)from);
+    for (int64_t i = 0; i < to; i++) values[i] = dot(from, matrix + i * from, old);
+}
+
+/* The state with other modes: `matrix` carries the slopes, which stay above zero. */
+static void prolong(const Table *from, const Table *to, const double *matrix, State *state) {
+    double least = state->w[0];
+    for (int64_t i = 1; i < from->points; i++) least = smaller(least, state->w[i]);
+    for (int64_t k = from->modes; k < to->modes; k++) state->c[k] = 0.0;
+    carried(to->points, from->points, matrix, state->w);
+    for (int64_t i = 0; i < to->points; i++)
+        if (!(state->w[i] > 0.0)) state->w[i] = least;
+}
+
+/* The state to `tolerance`, at the resolution that it needs. `tables` has one for so many modes at that place, or none.
+   `relaxed`: a state whose hoop stress is clearly negative is left to others at once. */
+static int refine(Problem *problem, const Table *const *tables, int64_t modes, double tolerance, int relaxed, Grid *grid,
+                  State *state, Iterate *found, double *error) {
+    double aim = goal(tolerance), previous = NAN;
+    int64_t steps = 0;
+    if (!tables[modes]) return NEEDS_TABLE;
+    lay(grid, tables[modes], problem->span);
+    guess(problem, grid, state);
+    for (;;) {
+        *found = newton(problem, grid, state, aim, MOST_STEPS);
+        steps += found->steps;
+        found->steps = steps;
+        if (!found->ok || (relaxed && found->hoop <= CLEARLY_NEGATIVE)) return LEFT_TO_OTHERS;
+        *error = estimate(found, previous, tolerance);
+        if (*error <= tolerance) return TAUT;
+        previous = found->lam;
+        const Table *now = grid->table;
+        if (now->next > MOST_MODES) return LEFT_TO_OTHERS;
+        if (!tables[now->next]) return NEEDS_TABLE;
+        prolong(now, tables[now->next], now->carry, state);
+        lay(grid, tables[now->next], problem->span);
+    }
+}
+
+#endif

@@ -1,0 +1,313 @@
+/* The Ritz form of the membrane problem and its Newton step: model/membrane/ritz.py, for one state whose film is one
+   element, taut everywhere. Equations stand there; names are the same.
+
+   x = ln(R/b) in [-span, 0]. Unknowns: e = r/R - 1 as a sum of modes (coefficients c), the slope w = -dz/dR at every
+   point, and the force lam. q = dr/dR - 1 = e + de/dx. */
+#ifndef DEA_RITZ_H
+#define DEA_RITZ_H
+
+#include "law.h"
+
+enum {
+    MOST_MODES = 36,
+    MOST_POINTS = MOST_MODES + 3,
+    MOST_PAIRS = MOST_MODES * (MOST_MODES + 1) / 2,
+};
+
+/* Modes and quadrature on [-1, 1], made by model/membrane/compiled.py: N modes, Q points, rows before columns. */
+typedef struct {
+    int64_t modes, points;
+    int64_t next;             /* modes of the next resolution */
+    const double *xi;         /* (Q) */
+    const double *weight;     /* (Q) */
+    const double *values;     /* (2, N, Q): modes at the points, their derivatives in xi */
+    const double *project;    /* (Q, 2, N): the same, point by point */
+    const double *pairs;      /* (Q, 3, N (N+1)/2): products of two modes; one with the other's derivative; both */
+    const double *ends;       /* (2, Q): extrapolation to xi = -1 and 1 */
+    const double *edge_tests; /* (2, 2, Q): test functions of disk and ring, each with its derivative */
+    const double *fine;       /* (Q, FINE): interpolation to the FINE points */
+    const double *fine_xi;    /* (FINE) */
+    const double *legendre;   /* (Q, Q): from values at the points to Legendre coefficients */
+    const double *carry;      /* (next points, Q): interpolation to the points of the next resolution */
+    const double *check;      /* (CHECK_POINTS, Q): to the points of CHECK_MODES */
+} Table;
+
+/* One state to solve, dimensionless, and how many points of its law were computed. */
+typedef struct {
+    Law law;
+    double field; /* eps (V/T)^2 / G; 0 without voltage */
+    double log_prestretch, span, height;
+    int64_t mechanical, electric;
+} Problem;
+
+/* A table laid on the film. */
+typedef struct {
+    const Table *table;
+    double radius[MOST_POINTS]; /* R/b */
+    double once[MOST_POINTS];   /* weight dx R */
+    double twice[MOST_POINTS];  /* weight dx R^2 */
+    double dxi;                 /* d(xi)/dx */
+} Grid;
+
+typedef struct {
+    double c[MOST_MODES];
+    double w[MOST_POINTS];
+} State;
+
+/* The state at the points. */
+typedef struct {
+    double e[MOST_POINTS], q[MOST_POINTS];
+    double log[3 * MOST_POINTS]; /* L1, L2, L3 */
+    Stress law;
+    double along[MOST_POINTS];  /* dL1/dp */
+    double down[MOST_POINTS];   /* dL1/dw */
+    double around[MOST_POINTS]; /* dL2/de */
+    double metric[MOST_POINTS]; /* p^2 + w^2 */
+} Points;
+
+/* The Newton system after the slopes are eliminated: height = reach + give lam - coupling . dc. */
+typedef struct {
+    double matrix[MOST_PAIRS]; /* lower triangle, row by row; after `factor` L below the diagonal and D on it */
+    double diagonal[MOST_MODES];
+    double residual[MOST_MODES], coupling[MOST_MODES];
+    double give, reach;
+    double hw[MOST_POINTS], kqw[MOST_POINTS], kew[MOST_POINTS], gw[MOST_POINTS];
+    int positive;
+} Reduced;
+
+/* One Newton step: the change of the state and the force after it. */
+typedef struct {
+    double dc[MOST_MODES], dw[MOST_POINTS];
+    double lam;
+    int stable;
+} Step;
+
+static void lay(Grid *grid, const Table *table, double span) {
+    double half = 0.5 * span;
+    grid->table = table;
+    grid->dxi = 1.0 / half;
+    for (int64_t i = 0; i < table->points; i++) {
+        double radius = exp_of(half * (table->xi[i] - 1.0));
+        double once = table->weight[i] * half * radius;
+        grid->radius[i] = radius;
+        grid->once[i] = once;
+        grid->twice[i] = once * radius;
+    }
+}
+
+/* e and q at the points, or their changes, from the modes' coefficients. */
+static void strain(const Grid *grid, const double *c, double *e, double *q) {
+    int64_t points = grid->table->points, modes = grid->table->modes;
+    for (int64_t i = 0; i < points; i++) e[i] = q[i] = 0.0;
+    for (int64_t k = 0; k < modes; k++) {
+        const double *value = grid->table->values + k * points, *slope = value + modes * points;
+        for (int64_t i = 0; i < points; i++) {
+            e[i] += c[k] * value[i];
+            q[i] += c[k] * slope[i];
+        }
+    }
+    for (int64_t i = 0; i < points; i++) q[i] = q[i] * grid->dxi + e[i];
+}
+
+/* True stress dW-star/dL_i and its tangent: the law's, less the Maxwell stress k exp(2 (L1 + L2)). */
+static void stress(Problem *problem, int64_t n, const double *log, Stress *out) {
+    derivatives_of_law(&problem->law, n, log, out);
+    problem->mechanical += n;
+    for (int64_t i = 0; i < n; i++) out->maxwell[i] = 0.0;
+    if (problem->field == 0.0) return;
+    problem->electric += n;
+    for (int64_t i = 0; i < n; i++) {
+        double b = problem->field * exp_of(-2.0 * log[2 * n + i]);
+        out->maxwell[i] = b;
+        out->t1[i] -= b;
+        out->t2[i] -= b;
+        out->h11[i] -= 2.0 * b;
+        out->h12[i] -= 2.0 * b;
+        out->h22[i] -= 2.0 * b;
+    }
+}
+
+/* Strains, stresses and tangents of a state. */
+static void evaluate(Problem *problem, const Grid *grid, const State *state, Points *at) {
+    int64_t n = grid->table->points;
+    strain(grid, state->c, at->e, at->q);
+    for (int64_t i = 0; i < n; i++) {
+        double e = at->e[i], q = at->q[i], w = state->w[i], g = (q + 2.0) * q + w * w;
+        at->metric[i] = g + 1.0;
+        at->along[i] = (q + 1.0) / (g + 1.0);
+        at->down[i] = w / (g + 1.0);
+        at->around[i] = 1.0 / (e + 1.0);
+        at->log[i] = g;
+        at->log[n + i] = e;
+    }
+    for (int64_t i = 0; i < 2 * n; i++) at->log[i] = log1p_of(at->log[i]);
+    for (int64_t i = 0; i < n; i++) {
+        double log1 = 0.5 * at->log[i] + problem->log_prestretch;
+        double log2 = at->log[n + i] + problem->log_prestretch;
+        at->log[i] = log1;
+        at->log[n + i] = log2;
+        at->log[2 * n + i] = -(log1 + log2);
+    }
+    stress(problem, n, at->log, &at->law);
+}
+
+/* `sum over points of ee e e' + eq (e q' + q e') + qq q q'` for every pair of modes, and of `on_e e + on_q q`. The
+   three sums come in terms of a mode's value and of its derivative in xi. */
+typedef struct {
+    double pair[3][MOST_POINTS], coupling[2][MOST_POINTS], residual[2][MOST_POINTS];
+} Weights;
+
+static void assemble(const Table *table, const Weights *on, Reduced *system) {
+    int64_t modes = table->modes, pairs = modes * (modes + 1) / 2;
+    for (int64_t k = 0; k < modes; k++) system->coupling[k] = system->residual[k] = 0.0;
+    for (int64_t p = 0; p < pairs; p++) system->matrix[p] = 0.0;
+    for (int64_t i = 0; i < table->points; i++) {
+        const double *value = table->project + 2 * i * modes, *slope = value + modes;
+        double c0 = on->coupling[0][i], c1 = on->coupling[1][i], r0 = on->residual[0][i], r1 = on->residual[1][i];
+        for (int64_t k = 0; k < modes; k++) {
+            system->coupling[k] += c0 * value[k] + c1 * slope[k];
+            system->residual[k] += r0 * value[k] + r1 * slope[k];
+        }
+        const double *both = table->pairs + 3 * i * pairs, *mixed = both + pairs, *slopes = mixed + pairs;
+        double m0 = on->pair[0][i], m1 = on->pair[1][i], m2 = on->pair[2][i];
+        for (int64_t p = 0; p < pairs; p++) system->matrix[p] += m0 * both[p] + m1 * mixed[p] + m2 * slopes[p];
+    }
+}
+
+/* Assemble the Newton system of the modes alone: a slope stands alone at its point and is eliminated there. */
+static void reduce(const Grid *grid, const double *w, const Points *at, Reduced *system) {
+    const Stress *law = &at->law;
+    Weights on;
+    double give[MOST_POINTS], reach[MOST_POINTS], kww[MOST_POINTS];
+    int64_t n = grid->table->points;
+    for (int64_t i = 0; i < n; i++) {
+        double along = at->along[i], down = at->down[i], around = at->around[i];
+        double t1 = law->t1[i], t2 = law->t2[i];
+        double once = grid->once[i], twice = grid->twice[i];
+        double tm = t1 / at->metric[i], d = law->h11[i] - 2.0 * t1, slope = d * down;
+        kww[i] = slope * down + tm;
+        double hw = 1.0 / kww[i], kqw = slope * along, h12a = law->h12[i] * around, kew = h12a * down, gw = t1 * down;
+        double thw = tm * hw, hkew = hw * kew, hg = hw * gw;
+        double qq = twice * ((d / at->metric[i] + tm) * thw); /* K_qq - K_qw^2 / K_ww without the cancellation */
+        double eq = twice * (h12a * along * thw);
+        double ee = twice * ((law->h22[i] - t2) * (around * around) - kew * hkew);
+        on.pair[0][i] = (ee + eq) + (qq + eq);
+        on.pair[1][i] = (qq + eq) * grid->dxi;
+        on.pair[2][i] = qq * (grid->dxi * grid->dxi);
+        double on_q = once * (hw * kqw);
+        on.coupling[0][i] = once * hkew + on_q;
+        on.coupling[1][i] = on_q * grid->dxi;
+        on_q = twice * (t1 * along - hg * kqw);
+        on.residual[0][i] = twice * (t2 * around - hg * kew) + on_q;
+        on.residual[1][i] = on_q * grid->dxi;
+        give[i] = once * hw / grid->radius[i];
+        reach[i] = once * (w[i] - hg);
+        system->hw[i] = hw;
+        system->kqw[i] = kqw;
+        system->kew[i] = kew;
+        system->gw[i] = gw;
+    }
+    assemble(grid->table, &on, system);
+    system->give = system->reach = 0.0;
+    system->positive = 1;
+    for (int64_t i = 0; i < n; i++) {
+        system->give += give[i];
+        system->reach += reach[i];
+        if (!(kww[i] > 0.0)) system->positive = 0;
+    }
+}
+
+/* Eliminate the multiplier, which makes the matrix positive definite exactly where the state is stable, and take it
+   apart into L D L'. Returns whether it is positive definite; another matrix gets what it gets. */
+static int factor(int64_t n, Reduced *system) {
+    int positive = 1;
+    double *row = system->matrix;
+    for (int64_t i = 0; i < n; i++, row += i) {
+        double share = system->coupling[i] / system->give;
+        for (int64_t j = 0; j <= i; j++) row[j] += share * system->coupling[j];
+        system->diagonal[i] = row[i];
+        const double *other = system->matrix;
+        for (int64_t j = 0; j < i; j++, other += j)
+            for (int64_t k = 0; k < j; k++) row[j] -= row[k] * other[k];
+        other = system->matrix;
+        for (int64_t j = 0; j < i; j++, other += j) {
+            double part = row[j] / other[j];
+            row[i] -= part * row[j];
+            row[j] = part;
+        }
+        if (!(row[i] > 0.0)) positive = 0;
+    }
+    return positive;
+}
+
+/* Solve the factored system in place. */
+static void substitute(int64_t n, const Reduced *system, double *x) {
+    const double *row = system->matrix;
+    for (int64_t i = 0; i < n; i++, row += i)
+        for (int64_t j = 0; j < i; j++) x[i] -= row[j] * x[j];
+    row = system->matrix;
+    for (int64_t i = 0; i < n; i++, row += i) x[i] /= row[i];
+    for (int64_t i = n - 1; i >= 0; i--) {
+        row = system->matrix + i * (i + 1) / 2;
+        for (int64_t j = 0; j < i; j++) x[j] -= row[j] * x[i];
+    }
+}
+
+/* How the slopes follow a change `dc` of the modes with the force `lam`. */
+static void slopes(const Grid *grid, const Reduced *system, const double *dc, double lam, int gradient, double *dw) {
+    double de[MOST_POINTS], dq[MOST_POINTS];
+    strain(grid, dc, de, dq);
+    for (int64_t i = 0; i < grid->table->points; i++) {
+        double rest = lam / grid->radius[i] - (gradient ? system->gw[i] : 0.0);
+        dw[i] = (rest - dq[i] * system->kqw[i] - de[i] * system->kew[i]) * system->hw[i];
+    }
+}
+
+static double dot(int64_t n, const double *x, const double *y) {
+    double total = 0.0;
+    for (int64_t i = 0; i < n; i++) total += x[i] * y[i];
+    return total;
+}
+
+/* The Newton step at a state; `system` is left factored. */
+static void newton_step(const Problem *problem, const Grid *grid, const double *w, const Points *at, Reduced *system,
+                        Step *step) {
+    int64_t modes = grid->table->modes;
+    reduce(grid, w, at, system);
+    double lam0 = (problem->height - system->reach) / system->give;
+    int positive = factor(modes, system);
+    for (int64_t k = 0; k < modes; k++) step->dc[k] = -(system->residual[k] + lam0 * system->coupling[k]);
+    substitute(modes, system, step->dc);
+    step->lam = lam0 + dot(modes, system->coupling, step->dc) / system->give;
+    step->stable = positive && system->positive;
+    slopes(grid, system, step->dc, step->lam, 1, step->dw);
+}
+
+/* The derivative of the state and of the force with respect to h/b, from a factored system. */
+static void tangent(const Grid *grid, const Reduced *system, Step *by_height) {
+    int64_t modes = grid->table->modes;
+    for (int64_t k = 0; k < modes; k++) by_height->dc[k] = -(system->coupling[k] / system->give);
+    substitute(modes, system, by_height->dc);
+    by_height->lam = (1.0 + dot(modes, system->coupling, by_height->dc)) / system->give;
+    slopes(grid, system, by_height->dc, by_height->lam, 0, by_height->dw);
+}
+
+/* A first state: r = R, and slopes that follow the power law w ~ R^(-1/n) of the film at its mean slope. */
+static void guess(Problem *problem, const Grid *grid, State *state) {
+    int64_t n = grid->table->points;
+    double mean = problem->height / -expm1_of(-problem->span), square = mean * mean;
+    double log1 = 0.5 * log1p_of(square) + problem->log_prestretch, log2 = problem->log_prestretch;
+    double log[3] = {log1, log2, -(log1 + log2)};
+    Stress law;
+    stress(problem, 1, log, &law);
+    double part = square / (1.0 + square);
+    double power = law.t1[0] > 0.0 ? 1.0 - 2.0 * part + part * law.h11[0] / law.t1[0] : 1.0;
+    if (!(power > 0.5)) power = 1.0;
+    for (int64_t k = 0; k < grid->table->modes; k++) state->c[k] = 0.0;
+    for (int64_t i = 0; i < n; i++)
+        state->w[i] = exp_of(0.5 * problem->span * (1.0 - grid->table->xi[i]) / power);
+    double scale = problem->height / dot(n, grid->once, state->w);
+    for (int64_t i = 0; i < n; i++) state->w[i] *= scale;
+}
+
+#endif

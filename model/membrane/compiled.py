@@ -1,0 +1,297 @@
+"""The compiled kernel (`model/kernel/membrane.c`): taut states of one element, by the steps of `model.membrane.ritz`.
+
+What it leaves to others (wrinkled or doubtful states, films of a huge span, laws that exist in Python only) is solved
+by the methods for arrays, as everything is where there is no kernel.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from ctypes import POINTER, Structure, c_double, c_int64
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import Array
+from model.kernel.library import load
+from model.material.law import Evaluations, Law
+from model.material.materials import Material
+from model.material.ogden import Ogden
+from model.membrane import output, ritz
+from model.membrane.flat import Flat
+from model.membrane.from_rest import CHECK_MODES
+from model.membrane.refinement import SPANS, first_modes, next_modes
+from model.specimen import Specimen
+
+MOST_MODES, MOST_PARAMETERS = 36, 8
+MOST_POINTS = MOST_MODES + ritz.MORE_POINTS
+LAWS: tuple[type[Law], ...] = (Ogden,)  # in the order of their numbers in law.h
+SLOPES = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
+NUMBERS = (
+    *("force", "peak_field", "peak_field_radius", "min_hoop_stress", "min_meridional_stress", "max_stretch"),
+    *("error_estimate", "iterations", "modes"),
+)
+NEEDS_TABLE = -2  # in place of a status, of which the negative ones are left to others
+FEW_LEVELS = 3  # resolutions whose tables are made at once; most states need two
+
+
+class _Table(Structure):
+    """`Table` in ritz.h."""
+
+    _fields_ = [(name, c_int64) for name in ("modes", "points", "next")] + [
+        (name, POINTER(c_double))
+        for name in (
+            *("xi", "weight", "values", "project", "pairs", "ends", "edge_tests"),
+            *("fine", "fine_xi", "legendre", "carry", "check"),
+        )
+    ]
+
+
+class _Task(Structure):
+    """`Task` in membrane.c."""
+
+    _fields_ = [
+        ("tables", POINTER(_Table) * (MOST_MODES + 1)),
+        ("first_modes", c_int64 * len(SPANS)),
+        ("relaxed", c_int64),
+        ("sensitivities", c_int64),
+        ("tolerance", c_double),
+    ]
+
+
+class _Law(Structure):
+    """`Law` in law.h."""
+
+    _fields_ = [
+        *((name, c_int64) for name in ("kind", "moduli", "shapes")),
+        ("mu", c_double * MOST_PARAMETERS),
+        ("alpha", c_double * MOST_PARAMETERS),
+    ]
+
+
+class _Film(Structure):
+    """`Film` in membrane.c."""
+
+    _fields_ = [
+        *((name, c_double) for name in ("disk_radius", "ring_radius", "thickness", "prestretch")),
+        *((name, c_double) for name in ("shear_modulus", "eps_r", "permittivity")),
+        ("law", _Law),
+    ]
+
+
+class _Slopes(Structure):
+    """`Slopes` in membrane.c."""
+
+    _fields_ = [
+        *((name, c_double) for name in SLOPES),
+        ("mu", c_double * MOST_PARAMETERS),
+        ("alpha", c_double * MOST_PARAMETERS),
+    ]
+
+
+class _Answer(Structure):
+    """`Answer` in membrane.c."""
+
+    _fields_ = [
+        *((name, c_double) for name in NUMBERS[:7]),
+        ("lam", c_double),
+        *((name, c_int64) for name in ("status", "iterations", "modes", "mechanical", "electric")),
+        ("dforce", _Slopes),
+    ]
+
+
+class _State(Structure):
+    """`State` in ritz.h."""
+
+    _fields_ = [("c", c_double * MOST_MODES), ("w", c_double * MOST_POINTS)]
+
+
+@lru_cache(maxsize=MOST_MODES)
+def _table(modes: int) -> tuple[_Table, list[Array]]:
+    """Tables of `model.membrane.ritz` as the kernel reads them, and the arrays that must outlive them."""
+    t, after = ritz.table(modes), next_modes(modes)
+    n, points = modes, t.points
+    functions = np.stack((t.values[:points, :n], t.values[points:, :n]))  # (2, Q, N)
+    pairs = t.pairs[: n * (n + 1) // 2].reshape(-1, 3, points)
+    arrays = {
+        "xi": t.xi,
+        "weight": t.weight,
+        "values": functions.transpose(0, 2, 1),
+        "project": functions.transpose(1, 0, 2),
+        "pairs": pairs.transpose(2, 1, 0),
+        "ends": t.ends,
+        "edge_tests": np.array(output.edge_tests(modes)),
+        "fine": output.fine_table(modes).T,
+        "fine_xi": -np.cos(np.linspace(0.0, np.pi, output.FINE)),
+        "legendre": t.to_legendre.T,
+        "carry": ritz.transfer(modes, after),
+        "check": ritz.transfer(modes, CHECK_MODES),
+    }
+    kept = {name: np.ascontiguousarray(values, dtype=np.float64) for name, values in arrays.items()}
+    pointers = {name: values.ctypes.data_as(POINTER(c_double)) for name, values in kept.items()}
+    return _Table(modes=modes, points=points, next=after, **pointers), list(kept.values())
+
+
+@lru_cache(maxsize=64)
+def _task(tolerance: float, relaxed: bool, sensitivities: bool, whole: bool) -> _Task:
+    """What the states of a call share; tables of every resolution when ``whole``, else of the first ones."""
+    firsts = [first_modes(span, tolerance) for span in SPANS]
+    task = _Task((), tuple(firsts), relaxed, sensitivities, tolerance)
+    for modes in {*firsts, CHECK_MODES}:
+        level = 0
+        while modes <= MOST_MODES and (whole or level < FEW_LEVELS):
+            task.tables[modes] = ctypes.pointer(_table(modes)[0])
+            modes, level = next_modes(modes), level + 1
+    return task
+
+
+def _film(specimen: Specimen) -> _Film:
+    """A film as the kernel reads it; one that it does not know has a law without a number."""
+    m = specimen.material
+    if m.law not in LAWS or max(len(m.mu), len(m.alpha)) > MOST_PARAMETERS:
+        return _Film(law=_Law(-1))
+    return _Film(
+        specimen.disk_radius,
+        specimen.ring_radius,
+        specimen.thickness,
+        specimen.prestretch,
+        m.shear_modulus,
+        m.eps_r,
+        m.permittivity,
+        _Law(LAWS.index(m.law), len(m.mu), len(m.alpha), m.mu, m.alpha),
+    )
+
+
+@lru_cache(maxsize=1)
+def _solver() -> Any:
+    """The kernel's function; None where there is no kernel."""
+    library = load()
+    if library is None:
+        return None
+    function = library.dea_kernel_solve
+    function.restype = c_int64
+    function.argtypes = [
+        *(POINTER(_Task), POINTER(_Film), c_int64, POINTER(c_int64), c_int64),
+        *(POINTER(c_double), POINTER(c_double), POINTER(_Answer), POINTER(_State)),
+    ]
+    return function
+
+
+@dataclass(frozen=True, slots=True)
+class One:
+    """One solved state."""
+
+    answer: Any  # _Answer
+    state: Any  # _State
+    span: float
+
+    @property
+    def lam(self) -> float:
+        return float(self.answer.lam)
+
+    def arrays(self) -> tuple[ritz.Grid, ritz.State]:
+        """The state as the rest of the model has it."""
+        modes = self.answer.modes
+        grid = ritz.Grid.lay(modes, np.array([[-self.span], [0.0]]))
+        c, w = np.array(self.state.c[:modes]), np.array(self.state.w[: modes + ritz.MORE_POINTS])
+        return grid, ritz.State(c[:, None], w[:, None, None])
+
+    def dforce(self, material: Material) -> dict[str, Any]:
+        """The derivatives of the force, as `model.membrane.solution.Solutions` has them."""
+        slopes = self.answer.dforce
+        found: dict[str, Any] = {name: getattr(slopes, name) for name in SLOPES}
+        return found | {
+            "mu": np.array(slopes.mu[: len(material.mu)]),
+            "alpha": np.array(slopes.alpha[: len(material.alpha)]),
+        }
+
+
+def solve_one(
+    specimen: Specimen, h: float, voltage: float, *, tolerance: float, relaxed: bool, sensitivities: bool
+) -> One | None:
+    """One state, or None where it is left to others."""
+    solver = _solver()
+    if solver is None:
+        return None
+    film, answer, state = _film(specimen), _Answer(), _State()
+    for whole in (False, True):
+        task = _task(tolerance, relaxed, sensitivities, whole)
+        solver(task, film, 1, _FIRST, 1, c_double(h), c_double(voltage), answer, state)
+        if answer.status != NEEDS_TABLE:
+            break
+    return One(answer, state, math.log(specimen.ring_radius / specimen.disk_radius)) if answer.status >= 0 else None
+
+
+_FIRST = c_int64(0)  # the only film of a call for one state
+
+
+def solve_states(
+    result: Flat,
+    count: Evaluations,
+    specimens: Sequence[Specimen],
+    which: NDArray[np.intp],
+    h: Array,
+    voltage: Array,
+    *,
+    tolerance: float,
+    relaxed: bool,
+) -> NDArray[np.bool_]:
+    """Write the states (S,) of ``specimens[which]`` into ``result``; tells which are left to others."""
+    solver = _solver()
+    left = np.ones(len(h), dtype=np.bool_)
+    if solver is None:
+        return left
+    films = (_Film * len(specimens))(*(_film(specimen) for specimen in specimens))
+    for whole in (False, True):
+        some = np.flatnonzero(left)
+        of, hh, vv = (np.ascontiguousarray(x[some]) for x in (which.astype(np.int64), h, voltage))
+        answers = (_Answer * len(some))()
+        task = _task(tolerance, relaxed, result.dforce is not None, whole)
+        solver(
+            *(task, films, len(films), of.ctypes.data_as(POINTER(c_int64)), len(some)),
+            *(hh.ctypes.data_as(POINTER(c_double)), vv.ctypes.data_as(POINTER(c_double)), answers, None),
+        )
+        found = np.frombuffer(answers, dtype=np.dtype(_Answer))
+        good = found["status"] >= 0
+        _place(result, specimens, which, some[good], found[good])
+        count.mechanical += int(found["mechanical"][good].sum())
+        count.electric += int(found["electric"][good].sum())
+        left[some[good]] = False
+        if not (found["status"] == NEEDS_TABLE).any():
+            break
+    return left
+
+
+def _place(
+    result: Flat,
+    specimens: Sequence[Specimen],
+    which: NDArray[np.intp],
+    to: NDArray[np.intp],
+    found: NDArray[np.void],
+) -> None:
+    for values in (result.real, result.whole):
+        for name, array in values.items():
+            array[to] = found[name]
+    result.status[to] = found["status"]
+    result.flag["stable"][to] = True
+    materials = [specimen.material for specimen in specimens]
+    of = which[to]
+    for name, quantity, limits in (
+        ("field_exceeded", "peak_field", [m.breakdown_field or math.inf for m in materials]),
+        ("stretch_exceeded", "max_stretch", [m.max_stretch or math.inf for m in materials]),
+    ):
+        result.flag[name][to] = found[quantity] > np.array(limits)[of]
+    if result.dforce is None:
+        return
+    slopes = found["dforce"]
+    for name in SLOPES:
+        result.dforce[name][to] = slopes[name]
+    for name, given in (("mu", [len(m.mu) for m in materials]), ("alpha", [len(m.alpha) for m in materials])):
+        width = result.dforce[name].shape[1]
+        absent = np.arange(width) >= np.array(given, dtype=np.intp)[of][:, None]
+        result.dforce[name][to] = np.where(absent, np.nan, slopes[name][:, :width])
