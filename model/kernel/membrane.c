@@ -1,9 +1,9 @@
 /* The membrane's equilibrium, many states after one another: the kernel of model/membrane/solve.py.
 
-   It treats one-element films that stay taut, on the branch that a cold start finds without doubt; every other state is
-   left to the methods for arrays (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so
+   It treats films of one element whose every point is taut and that are on the branch from rest by a look at their
+   energy, or by few steps of the voltage; every other state is left to the methods for arrays (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so
    that nothing depends on the others. */
-#include "output.h"
+#include "connected.h"
 
 #ifdef _WIN32
 #define EXPORT __declspec(dllexport)
@@ -130,9 +130,10 @@ static int64_t answer(const Task *task, const Film *film, double h, double volta
     if (status != TAUT) return status;
     evaluate(&problem, &grid, state, &at);
     extremes(&problem, &grid, &at, found.lam, &x);
-    if (!(x.meridional > 0.0) || !(x.softening <= SOFTENING)) return LEFT_TO_OTHERS;
     int wrinkled = !(x.hoop >= ROUND_OFF_TENSION * x.meridional);
-    if (wrinkled && task->relaxed) return LEFT_TO_OTHERS;
+    if (!(x.meridional > 0.0) || (wrinkled && task->relaxed)) return LEFT_TO_OTHERS;
+    if (!(x.softening <= SOFTENING) && !connected(&problem, task->tables[CHECK_MODES], &grid, state, found.lam))
+        return LEFT_TO_OTHERS;
     out->lam = found.lam;
     out->iterations = found.steps;
     out->modes = grid.table->modes;
@@ -157,6 +158,7 @@ static int is_task(const Task *task) {
     }
     for (int64_t k = 0; k < 3; k++)
         if (task->first_modes[k] < 2 || task->first_modes[k] > MOST_MODES) return 0;
+    if (!task->tables[CHECK_MODES]) return 0;
     return task->tolerance >= 1e-12 && task->tolerance <= 1e-2;
 }
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Sequence
-from ctypes import POINTER, Structure, c_double, c_int64
+from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -175,10 +175,7 @@ def _solver() -> Any:
         return None
     function = library.dea_kernel_solve
     function.restype = c_int64
-    function.argtypes = [
-        *(POINTER(_Task), POINTER(_Film), c_int64, POINTER(c_int64), c_int64),
-        *(POINTER(c_double), POINTER(c_double), POINTER(_Answer), POINTER(_State)),
-    ]
+    function.argtypes = [c_void_p, c_void_p, c_int64, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p]
     return function
 
 
@@ -218,16 +215,19 @@ def solve_one(
     solver = _solver()
     if solver is None:
         return None
-    film, answer, state = _film(specimen), _Answer(), _State()
+    film, answer, state = _one_film(specimen), _Answer(), _State()
     for whole in (False, True):
         task = _task(tolerance, relaxed, sensitivities, whole)
-        solver(task, film, 1, _FIRST, 1, c_double(h), c_double(voltage), answer, state)
+        where = byref(c_double(h)), byref(c_double(voltage))
+        solver(byref(task), byref(film), 1, byref(_FIRST), 1, *where, byref(answer), byref(state))
         if answer.status != NEEDS_TABLE:
             break
     return One(answer, state, math.log(specimen.ring_radius / specimen.disk_radius)) if answer.status >= 0 else None
 
 
+_one_film = lru_cache(maxsize=16)(_film)
 _FIRST = c_int64(0)  # the only film of a call for one state
+_RECORD: np.dtype[Any] = np.dtype(_Answer)
 
 
 def solve_states(
@@ -249,14 +249,11 @@ def solve_states(
     films = (_Film * len(specimens))(*(_film(specimen) for specimen in specimens))
     for whole in (False, True):
         some = np.flatnonzero(left)
-        of, hh, vv = (np.ascontiguousarray(x[some]) for x in (which.astype(np.int64), h, voltage))
-        answers = (_Answer * len(some))()
+        of, hh, vv = which[some].astype(np.int64), h[some].astype(np.float64), voltage[some].astype(np.float64)
+        found = np.zeros(len(some), dtype=_RECORD)
         task = _task(tolerance, relaxed, result.dforce is not None, whole)
-        solver(
-            *(task, films, len(films), of.ctypes.data_as(POINTER(c_int64)), len(some)),
-            *(hh.ctypes.data_as(POINTER(c_double)), vv.ctypes.data_as(POINTER(c_double)), answers, None),
-        )
-        found = np.frombuffer(answers, dtype=np.dtype(_Answer))
+        data = [array.ctypes.data for array in (of, hh, vv, found)]
+        solver(byref(task), films, len(films), data[0], len(some), *data[1:], None)
         good = found["status"] >= 0
         _place(result, specimens, which, some[good], found[good])
         count.mechanical += int(found["mechanical"][good].sum())

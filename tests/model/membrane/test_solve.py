@@ -12,6 +12,7 @@ import pytest
 import scipy.constants
 
 from model.material.materials import EPSILON_0, NAMED, Material
+from model.membrane import compiled
 from model.membrane.solve import Status, Wrinkling, solve, solve_many
 from model.specimen import Specimen
 from model.verification.reference import reference
@@ -297,6 +298,12 @@ def test_no_profile_without_an_answer() -> None:
         solve(film(4, 1.0), 1e-3, 2500.0).profile()
 
 
+@pytest.fixture
+def no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "_solver", lambda: None)
+
+
+@pytest.mark.usefixtures("no_kernel")
 def test_the_path_for_one_state_has_the_digits_of_the_path_for_many() -> None:
     """A single taut state is solved without arrays, by the same steps: every result must be the same."""
     films = [film(a, lp) for a in (1.0, 4.0, 12.0) for lp in (1.0, 1.3)] + [film(6.0, 1.5, NAMED["treloar-ogden1972"])]
@@ -318,6 +325,7 @@ def test_the_path_for_one_state_has_the_digits_of_the_path_for_many() -> None:
     assert compared > 60
 
 
+@pytest.mark.usefixtures("no_kernel")
 def test_a_solution_nearby_shortens_the_way_and_changes_no_answer() -> None:
     near = solve(film(), 9.9e-3, 1480.0)
     cold, warm = solve(film(), 10e-3, 1500.0), solve(film(), 10e-3, 1500.0, near=near)

@@ -1,0 +1,189 @@
+"""The compiled kernel against the path for arrays: the same status and digits, alone or not, whatever it is given."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.arrays import Array
+from model.kernel.library import load, says
+from model.material.materials import NAMED, Material
+from model.membrane import compiled
+from model.membrane.solve import Solutions, Status, solve, solve_many
+from model.specimen import Specimen
+
+pytestmark = pytest.mark.skipif(load() is None, reason=says())
+
+NUMBERS = compiled.NUMBERS[:6]
+FILM = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
+
+
+@contextmanager
+def no_kernel() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled, "_solver", lambda: None)
+        yield
+
+
+def random_films(count: int, seed: int) -> tuple[list[Specimen], Array, Array]:
+    """a/b 0.02-0.7, h/b 0.01-1.5, lp 1-2, one to four Ogden terms with negative pairs, fields that leave many taut."""
+    random = np.random.default_rng(seed)
+    films, voltage = [], []
+    for _ in range(count):
+        terms = int(random.integers(1, 5))
+        sign = np.where(random.random(terms) < 0.2, -1.0, 1.0)
+        sign[0] = 1.0
+        alpha = sign * random.uniform(1.2, 6.0, terms)
+        mu = sign * 10 ** random.uniform(3, 5, terms)
+        thickness = 10 ** random.uniform(-5, -4)
+        material = Material("random", tuple(mu), tuple(alpha), random.uniform(1.5, 8.0), breakdown_field=50e6)
+        ratio = float(np.exp(random.uniform(np.log(0.02), np.log(0.7))))
+        films.append(Specimen(0.02 * ratio, 0.02, thickness, random.uniform(1.0, 2.0), material))
+        field = np.sqrt(material.shear_modulus / material.permittivity)
+        voltage.append(random.uniform(0.0, 0.5) * field * thickness if random.random() < 0.8 else 0.0)
+    return films, 0.02 * 10 ** random.uniform(-2, np.log10(1.5), count), np.array(voltage)
+
+
+def both(*args: object, **keywords: object) -> tuple[Solutions, Solutions]:
+    """The answers with the kernel, and those of the path for arrays."""
+    with no_kernel():
+        arrays = solve_many(*args, **keywords)  # type: ignore[arg-type]
+    return solve_many(*args, **keywords), arrays  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "low", "high"),
+    [(0, "exp", -700.0, 700.0), (1, "expm1", -40.0, 5.0), (2, "log", -40.0, 5.0), (3, "log1p", -40.0, 5.0)],
+)
+def test_elementary_functions_err_by_less_than_two_units_in_the_last_place(
+    kind: int, name: str, low: float, high: float
+) -> None:
+    random = np.random.default_rng(kind)
+    x = random.uniform(low, high, 20_000)
+    if kind:
+        x = np.exp(x)
+    if name in ("expm1", "log1p"):
+        x[::2] *= -1.0
+        x = x[x > -1.0] if name == "log1p" else x[x > -700.0]
+    if name == "expm1":
+        x = x[x < 700.0]
+    library = load()
+    assert library is not None
+    out = np.empty_like(x)
+    pointers = (a.ctypes.data_as(ctypes.c_void_p) for a in (x, out))
+    library.dea_kernel_elementary(ctypes.c_int64(kind), ctypes.c_int64(len(x)), *pointers)
+    truth = getattr(np, name)(x.astype(np.longdouble))
+    assert np.max(np.abs(out - truth) / np.spacing(np.abs(truth.astype(float)))) < 2.0
+
+
+@pytest.mark.parametrize("wrinkling", ["plain", "tension_field"])
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-9])
+def test_the_kernel_has_the_digits_of_the_path_for_arrays(wrinkling: str, tolerance: float) -> None:
+    films, h, voltage = random_films(60, seed=11)
+    h[::3] *= -1.0
+    state = {"tolerance": tolerance, "relaxed": wrinkling == "tension_field", "sensitivities": False}
+    known = [i for i in range(60) if compiled.solve_one(films[i], h[i], voltage[i], **state) is not None]
+    assert len(known) > 30
+    some = [films[i] for i in known]
+    mine, theirs = both(some, h[known], voltage[known], tolerance=tolerance, wrinkling=wrinkling, sensitivities=True)
+    np.testing.assert_array_equal(mine.status, theirs.status)
+    assert np.all(mine.answered)
+    for name in ("modes", "iterations", "stable", "field_exceeded", "stretch_exceeded"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)
+    np.testing.assert_allclose(mine.error_estimate, theirs.error_estimate, rtol=0.02)
+    for name in NUMBERS:
+        np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), rtol=1e-10, atol=1e-9, err_msg=name)
+    assert mine.dforce is not None
+    assert theirs.dforce is not None
+    for name, slopes in theirs.dforce.items():
+        size = np.nanmax(np.abs(slopes), axis=-1, keepdims=True) if slopes.ndim > 1 else np.abs(slopes)
+        size = np.where(size > 0.0, size, 1.0)  # by the voltage at 0 V
+        np.testing.assert_allclose(
+            mine.dforce[name] / size, slopes / size, rtol=1e-9, atol=1e-9, err_msg=name, equal_nan=True
+        )
+    assert 0 < mine.evaluations.electric < mine.evaluations.mechanical <= theirs.evaluations.mechanical
+
+
+def test_order_and_company_change_no_bit() -> None:
+    films, h, voltage = random_films(30, seed=5)
+    found = solve_many(films, h, 0.5 * voltage)
+    order = np.random.default_rng(2).permutation(30)
+    turned = solve_many([films[i] for i in order], h[order], 0.5 * voltage[order])
+    taut = found.status == Status.TAUT
+    assert taut.sum() > 15
+    for name in (*NUMBERS, "error_estimate"):
+        np.testing.assert_array_equal(getattr(turned, name)[taut[order]], getattr(found, name)[order][taut[order]])
+    alone = 0
+    for i in np.flatnonzero(taut).tolist():
+        one = solve(films[i], float(h[i]), 0.5 * float(voltage[i]))
+        if isinstance(one.quick, compiled.One):
+            alone += 1
+            assert [getattr(one, name) for name in NUMBERS] == [getattr(found, name)[i] for name in NUMBERS]
+    assert alone > 15
+
+
+def test_a_single_state_has_its_profile_and_capacitance_and_slopes() -> None:
+    one = solve(FILM, 10e-3, 1500.0, sensitivities=True)
+    assert isinstance(one.quick, compiled.One)
+    with no_kernel():
+        other = solve(FILM, 10e-3, 1500.0, sensitivities=True)
+    assert one.capacitance() == pytest.approx(other.capacitance(), rel=1e-12)
+    np.testing.assert_allclose(one.profile(11).z, other.profile(11).z, rtol=1e-9, atol=1e-15)
+    assert one.dforce is not None
+    assert other.dforce is not None
+    assert one.dforce.keys() == other.dforce.keys()
+    for name, value in other.dforce.items():
+        np.testing.assert_allclose(one.dforce[name], value, rtol=1e-9, err_msg=name)
+
+
+def test_flat_slack_and_impossible_states_have_the_status_of_the_path_for_arrays() -> None:
+    soft = Specimen(4e-3, 20e-3, 40e-6, 1.0, NAMED["parker-cao2018"])
+    narrow = replace(FILM, disk_radius=1e-4)  # a span of more than one element
+    h = [0.0, 10e-3, -10e-3, 1e-3, np.nan, np.inf, 10e-3]
+    for film, wrinkling in ((FILM, "plain"), (soft, "tension_field"), (narrow, "plain")):
+        v = [500.0, 0.0, 1000.0, 2500.0 if film is soft else 100.0, 0.0, 10.0, np.nan]
+        mine, theirs = both(film, h, v, tolerance=1e-6, wrinkling=wrinkling)
+        np.testing.assert_array_equal(mine.status, theirs.status)
+        np.testing.assert_allclose(mine.force, theirs.force, rtol=1e-9)
+
+
+def test_films_that_the_kernel_does_not_know_are_left_to_others() -> None:
+    many = Material("many", (1e4,) * 9, tuple(np.linspace(2.0, 4.0, 9)), 3.0)
+    state = {"tolerance": 1e-8, "relaxed": False, "sensitivities": False}
+    assert compiled.solve_one(FILM, 10e-3, 0.0, **state) is not None
+    assert compiled.solve_one(replace(FILM, material=many), 10e-3, 0.0, **state) is None
+    mine, theirs = both([FILM, replace(FILM, material=many)], 10e-3, 500.0)
+    np.testing.assert_allclose(mine.force, theirs.force, rtol=1e-10)
+
+
+def test_hostile_numbers_get_a_status_and_crash_nothing() -> None:
+    """Any bits as a film, a state, a number of terms, an index; a task that makes no sense is refused."""
+    random = np.random.default_rng(3)
+    solver = compiled._solver()
+    task = compiled._task(1e-8, True, True, True)
+    film, answers, state = compiled._film(FILM), (compiled._Answer * 1)(), compiled._State()
+    taut = 0
+    for _ in range(3000):
+        bad = compiled._Film.from_buffer_copy(film)
+        words = np.frombuffer(bad, dtype=np.int64)
+        for place in random.integers(0, len(words), random.integers(0, 3)):
+            words[place] = random.choice([0, -1, 3, 2**62, random.integers(-(2**62), 2**62)])
+        h, v = 10.0 ** random.uniform(-320, 300), 10.0 ** random.uniform(-5, 10)
+        which = ctypes.c_int64(int(random.choice([0, 0, 0, -1, 1, 2**62])))
+        args = (ctypes.c_double(random.choice([h, 1e-2, np.nan])), ctypes.c_double(random.choice([v, 800.0, -np.inf])))
+        assert solver(task, bad, 1, which, 1, *args, answers, state) in (0, 1)
+        if answers[0].status >= 0:
+            taut += 1
+            assert answers[0].status in (0, 1)
+            assert np.isfinite(answers[0].force)
+            assert 0.0 < answers[0].error_estimate <= 1e-8
+    assert taut > 50
+    for name, value in (("tolerance", np.nan), ("tolerance", 0.0), ("first_modes", (2**40, 4, 4))):
+        wrong = compiled._Task.from_buffer_copy(task)
+        setattr(wrong, name, value)
+        assert solver(wrong, film, 1, which, 1, *args, answers, state) == -1
