@@ -41,6 +41,16 @@ class Path:
         dt = t - self._t[i] if i else 0.0
         return self._x[i] + (self._v[i] + 0.5 * self._a[i] * dt) * dt, self._v[i] + self._a[i] * dt
 
+    def next_bend(self, t: float) -> float:
+        """When after ``t`` it begins its next piece; inf if never."""
+        i = bisect_right(self._t, t)
+        return self._t[i] if i < len(self._t) else math.inf
+
+    def bends_at(self, t: float) -> bool:
+        """Whether a piece begins at ``t``."""
+        i = bisect_right(self._t, t) - 1
+        return i > 0 and self._t[i] == t
+
     def follow(self, t: float, pieces: Iterable[tuple[float, float]]) -> None:
         """From time ``t`` on go through ``pieces`` (duration, acceleration), then stand still.
 

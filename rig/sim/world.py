@@ -14,14 +14,16 @@ import numpy.typing as npt
 
 from model.specimen import Specimen
 from rig.sim.electrodes import Electrodes, electrodes
-from rig.sim.film import FilmTable, Solve, solve_membrane, tabulate
+from rig.sim.film import DEFAULT_FIELD, REACH, FilmTable, Solve, solve_membrane, tabulate
+from rig.sim.film_course import FilmCourse
 from rig.sim.path import Path
 from rig.sim.truth import OutputTruth, RigTruth, StageTruth
+from rig.sim.viscous_film import Moment, ViscousFilm
 
 Floats = npt.NDArray[np.float64]
 
 CHARGE_S = 1e-4  # to either side of the instant at which a charging current is asked for
-TICK = 0.01  # s; the film's relaxation is integrated, and its strength checked, on this grid
+TICK = 0.01  # s; the strength of an elastic film is checked on this grid
 
 
 def true_specimen(rig: RigTruth, specimen: Specimen) -> Specimen:
@@ -33,14 +35,10 @@ def true_specimen(rig: RigTruth, specimen: Specimen) -> Specimen:
 
 
 class World:
-    r"""Stage, film and electrodes.
+    """Stage, film and electrodes.
 
-    The film's force is its equilibrium force at displacement and voltage, plus overstress branches
-    (quasi-linear viscoelasticity, Fung 1972), each driven by the elastic force F_e at zero volts:
-
-    .. math:: \dot q_i = g_i \dot F_e - q_i/\tau_i
-
-    integrated exactly for F_e linear in time within a tick. Rig compliance acts on the equilibrium force.
+    An elastic film's force is that of its table (`rig.sim.film`); one with branches is solved on its way
+    (`rig.sim.viscous_film`).
 
     Attributes
     ----------
@@ -87,12 +85,27 @@ class World:
         self.weight = 0.0
         self._table: FilmTable | None = None
         self._capacitance: Electrodes | None = None
-        self._branches = [(b.modulus_ratio, b.time_s) for b in rig.film.maxwell]
-        self._overstress = [0.0] * len(self._branches)
-        self._elastic = 0.0  # F_e at the last tick
+        self._reach = REACH * (specimen.ring_radius - specimen.disk_radius)
+        self._course = self._in_time(rig)
         self._tick = 0
         self._still: tuple[int, int] | None = None
         self._still_force = 0.0
+
+    def _in_time(self, rig: RigTruth) -> FilmCourse | None:
+        """The film on its way, of one that takes time."""
+        branches = [(one.modulus_ratio, one.time_s) for one in rig.film.maxwell if one.modulus_ratio > 0.0]
+        if not branches:
+            return None
+        film = self.specimen
+        strength = film.material.breakdown_field or DEFAULT_FIELD
+        return FilmCourse(
+            ViscousFilm(film, branches, self.compliance),
+            self.stage,
+            self.output,
+            lambda t: self.indentation_at(t) if self.fixture == "film" and not self.torn else 0.0,
+            film.ring_radius - film.disk_radius,
+            strength * film.thickness / film.prestretch**2,
+        )
 
     @property
     def film(self) -> FilmTable:
@@ -115,7 +128,7 @@ class World:
         return max(self.carriage_at(t) - self._contact, 0.0)
 
     def force_at(self, t: float) -> float:
-        """Force on the load cell (N), not more than a tick after the last one."""
+        """Force on the load cell (N), not later than `next_time`."""
         match self.fixture:
             case "film":
                 return self._film_force(t) + self.weight
@@ -126,14 +139,8 @@ class World:
     def _film_force(self, t: float) -> float:
         if self.torn:
             return 0.0
-        if self._branches:
-            s = self.indentation_at(t)
-            dt = max(t - self._tick * TICK, 0.0)
-            rise = self._elastic_force(s) - self._elastic
-            return self._equilibrium(s, t) + sum(
-                _relax(q, ratio, tau, dt, rise)
-                for q, (ratio, tau) in zip(self._overstress, self._branches, strict=True)
-            )
+        if self._course is not None:
+            return self._course.force(t)
         if t < max(self.stage.end, self.output.end):
             return self._equilibrium(self.indentation_at(t), t)
         state = (self.stage.changes, self.output.changes)
@@ -148,13 +155,12 @@ class World:
         if self.fixture != "film":
             return 0.0
         s = self.indentation_at(t)
-        return s if self.torn else s - self.compliance * self._equilibrium(s, t)
+        if self.torn:
+            return s
+        return s - self.compliance * (self._equilibrium(s, t) if self._course is None else self._course.force(t))
 
     def _equilibrium(self, s: float, t: float) -> float:
         return self.film.force(s, self.output.at(t)[0]) if s > 0 else 0.0
-
-    def _elastic_force(self, s: float) -> float:
-        return self.film.force(s, 0.0) if s > 0 else 0.0
 
     # At many times, for whoever looks at the truth
 
@@ -225,39 +231,51 @@ class World:
 
     def prepare(self) -> None:
         """Make now the tables that take long."""
-        _ = self.film
+        if self._course is None:
+            _ = self.film
         if self._electrodes is not None and self._electrodes.capacitance_of_film:
             self._capacitance = electrodes(self.specimen, self.compliance)
 
     @property
     def next_time(self) -> float:
-        """The next tick, inf while nothing can change."""
-        if self._branches or self._tick * TICK < max(self.stage.end, self.output.end):
+        """The next tick, or the end of the film's step; inf while nothing can change."""
+        if self._course is not None:
+            return self._course.end
+        if self._tick * TICK < max(self.stage.end, self.output.end):
             return (self._tick + 1) * TICK
         return math.inf
 
     def advance(self, t: float) -> None:
         """Let the ticks up to ``t`` happen."""
-        if self._branches:
-            while (self._tick + 1) * TICK <= t:
-                self._one_tick((self._tick + 1) * TICK)
-                self._tick += 1
-        else:
-            tick = math.floor(t / TICK + 1e-9)
-            if tick > self._tick:
-                moved = self.next_time < math.inf
-                self._tick = tick
-                if moved:
-                    self._check_strength(t)
+        if self._course is not None:
+            for moment in self._course.advance(t):
+                self._check_moment(moment)
+                if self.torn:
+                    self._course = None
+                    break
+            return
+        tick = math.floor(t / TICK + 1e-9)
+        if tick > self._tick:
+            moved = self.next_time < math.inf
+            self._tick = tick
+            if moved:
+                self._check_strength(t)
 
-    def _one_tick(self, t: float) -> None:
-        elastic = self._elastic_force(self.indentation_at(t))
-        rise = elastic - self._elastic
-        self._overstress = [
-            _relax(q, ratio, tau, TICK, rise) for q, (ratio, tau) in zip(self._overstress, self._branches, strict=True)
-        ]
-        self._elastic = elastic
-        self._check_strength(t)
+    def _check_moment(self, moment: Moment) -> None:
+        """Whether a film that takes time has torn or broken down.
+
+        By its field, or where it has no state any more; a slack film breaks down as an elastic one does.
+        """
+        if self.fixture != "film":
+            return
+        if moment.s > self._reach:
+            self.torn = True
+        if moment.voltage > 0.0 and not self.broken_down:
+            if moment.found == "slack":
+                self.broken_down = moment.voltage >= self.film.breakdown_voltage(moment.s)
+            else:
+                strength = self.specimen.material.breakdown_field or DEFAULT_FIELD
+                self.broken_down = moment.found == "lost" or moment.field >= strength
 
     def _check_strength(self, t: float) -> None:
         if self.fixture != "film":
@@ -268,10 +286,3 @@ class World:
         voltage = self.output.at(t)[0]
         if voltage > 0 and not self.broken_down:
             self.broken_down = voltage >= self.film.breakdown_voltage(s)
-
-
-def _relax(q: float, ratio: float, tau: float, dt: float, rise: float) -> float:
-    """Overstress after ``dt`` of an elastic force that rises by ``rise`` at a constant rate."""
-    x = dt / tau
-    mean = -math.expm1(-x) / x if x > 0 else 1.0
-    return q * math.exp(-x) + ratio * rise * mean

@@ -72,26 +72,92 @@ def step(w: World, t: float) -> None:
     w.advance(t)
 
 
-def test_relaxation_of_a_step_is_the_sum_of_exponentials():
-    w = world(film={"maxwell": [{"modulus_ratio": 0.3, "time_s": 2.0}]}, rig_compliance_um_per_N=0.0)
-    w.stage.ramp(0.0, CONTACT + 10e-3, 10.0)
-    step(w, 0.01)
-    for t in (0.5, 1.0, 4.0):
-        step(w, t)
-        assert at(w.force, t) == pytest.approx(exact(10e-3) * (1 + 0.3 * np.exp(-t / 2.0)), rel=3e-3)
-    step(w, 60.0)
-    assert at(w.force, 60.0) == pytest.approx(exact(10e-3), rel=1e-5)
+TWO_BRANCHES = [{"modulus_ratio": 0.1, "time_s": 1.0}, {"modulus_ratio": 0.1, "time_s": 30.0}]
 
 
-def test_relaxation_under_a_ramp():
-    """Constant rate of elastic force: q = g r tau (1 - exp(-t/tau))."""
-    w = world(film={"maxwell": [{"modulus_ratio": 0.5, "time_s": 1.0}]}, rig_compliance_um_per_N=0.0)
+def relaxing(branches=TWO_BRANCHES, prestretch=1.2, **settings) -> World:
+    """The paper's film with branches on a rig that does not give way."""
+    table = {"seed": 1, "stage": {"screw_error_um": 0.0}, "rig_compliance_um_per_N": 0.0} | settings
+    truth = SimulationSettings.model_validate(table | {"film": {"maxwell": branches, **settings.get("film", {})}})
+    film = Specimen(4e-3, 20e-3, 40e-6, prestretch, NAMED["parker-cao2018"])
+    return World(truth, truth.stage, truth.hv, film)
+
+
+def test_a_ramp_and_a_hold_of_a_film_that_takes_time():
+    """Reference forces of a code that shares nothing with this one, nor with the membrane model."""
+    w = relaxing()
     w.stage.rest(0.0, CONTACT)
-    w.stage.ramp(0.0, CONTACT + 1e-3, 1e-4)  # small: linear film
-    step(w, 3.004)
-    rate = STIFFNESS * 1e-4
-    expected = exact(3.004e-4) + 0.5 * rate * (1 - np.exp(-3.004))
-    assert at(w.force, 3.004) == pytest.approx(expected, rel=1e-3)
+    w.stage.ramp(0.0, CONTACT + 10e-3, 1e-3)
+    wanted = {8.823529: 0.174014016, 17.647059: 0.21955249, 44.117647: 0.217206552, 100.0: 0.215938708}
+    for t, force in wanted.items():
+        step(w, t)
+        assert at(w.force, t) == pytest.approx(force, abs=5e-5 * 0.22)
+
+
+def test_compliance_takes_its_share_of_a_film_that_takes_time():
+    w = relaxing(rig_compliance_um_per_N=2000.0)
+    w.stage.ramp(0.0, CONTACT + 10e-3, 20e-3)
+    step(w, 5.0)
+    force = at(w.force, 5.0)
+    assert at(w.displacement, 5.0) == pytest.approx(10e-3 - 2e-3 * force, rel=1e-12)
+    stiff = relaxing()
+    stiff.stage.ramp(0.0, CONTACT + at(w.displacement, 5.0), 20e-3)
+    step(stiff, 5.0)
+    assert at(stiff.force, 5.0) == pytest.approx(force, rel=2e-3)
+
+
+def test_a_week_at_rest_is_few_steps():
+    w = relaxing()
+    w.stage.rest(0.0, CONTACT)
+    w.stage.ramp(0.0, CONTACT + 10e-3, 10e-3)
+    count = 0
+    while w.next_time < 7 * 86400.0:
+        w.advance(w.next_time)
+        count += 1
+    assert count < 600
+    elastic = relaxing(branches=[])
+    elastic.stage.rest(0.0, CONTACT + 10e-3)
+    assert at(w.force, w.next_time) == pytest.approx(at(elastic.force, 1.0), rel=1e-5)
+
+
+def test_a_film_that_takes_time_breaks_down_by_its_field():
+    """At the voltage at which the elastic film does, for a field knows strains only; more slowly than it is asked."""
+    w, elastic = relaxing(), relaxing(branches=[])
+    elastic.stage.rest(0.0, CONTACT + 10e-3)
+    limit = elastic.film.breakdown_voltage(10e-3)
+    w.stage.ramp(0.0, CONTACT + 10e-3, 10e-3)
+    step(w, 400.0)
+    w.output.ramp(400.0, 0.97 * limit, 100.0)
+    step(w, 440.0)
+    assert not w.broken_down
+    assert at(w.force, 440.0) < 0.9 * at(elastic.force, 440.0)
+    w.output.ramp(440.0, 1.03 * limit, 100.0)
+    step(w, 600.0)
+    assert w.broken_down
+
+
+def test_a_film_pulled_back_faster_than_it_can_follow_hangs_slack_and_comes_back():
+    w = relaxing([{"modulus_ratio": 2.0, "time_s": 1.0}], prestretch=1.0)
+    w.stage.rest(0.0, CONTACT)
+    w.stage.ramp(0.0, CONTACT + 10e-3, 2e-3)
+    step(w, 20.0)
+    taut = at(w.force, 20.0)
+    w.stage.ramp(20.0, CONTACT + 1e-3, 30e-3)
+    step(w, 20.4)
+    assert taut > 0.05 and at(w.force, 20.4) < 1e-6
+    w.stage.ramp(21.0, CONTACT + 10e-3, 2e-3)
+    step(w, 60.0)
+    assert at(w.force, 60.0) == pytest.approx(taut, rel=0.02)
+
+
+def test_a_film_that_takes_time_tears_too():
+    w = relaxing()
+    w.stage.rest(0.0, CONTACT)
+    w.stage.ramp(0.0, CONTACT + 25e-3, 20e-3)
+    step(w, 0.9)
+    assert not w.torn and at(w.force, 0.9) > 0.0
+    step(w, 4.0)
+    assert w.torn and at(w.force, 4.0) == 0.0 and w.next_time >= 4.0
 
 
 def test_film_breaks_down_at_its_strength_and_conducts():
