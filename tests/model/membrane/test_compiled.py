@@ -175,8 +175,9 @@ def test_hostile_numbers_get_a_status_and_crash_nothing() -> None:
             words[place] = random.choice([0, -1, 3, 2**62, random.integers(-(2**62), 2**62)])
         h, v = 10.0 ** random.uniform(-320, 300), 10.0 ** random.uniform(-5, 10)
         which = ctypes.c_int64(int(random.choice([0, 0, 0, -1, 1, 2**62])))
-        args = (ctypes.c_double(random.choice([h, 1e-2, np.nan])), ctypes.c_double(random.choice([v, 800.0, -np.inf])))
-        assert solver(task, bad, 1, which, 1, *args, answers, state) in (0, 1)
+        where = [ctypes.c_double(random.choice(pair)) for pair in ([h, 1e-2, np.nan], [v, 800.0, -np.inf])]
+        given = [ctypes.byref(x) for x in (*where, answers, state)]
+        assert solver(ctypes.byref(task), ctypes.byref(bad), 1, ctypes.byref(which), 1, *given) in (0, 1)
         if answers[0].status >= 0:
             taut += 1
             assert answers[0].status in (0, 1)
@@ -186,4 +187,4 @@ def test_hostile_numbers_get_a_status_and_crash_nothing() -> None:
     for name, value in (("tolerance", np.nan), ("tolerance", 0.0), ("first_modes", (2**40, 4, 4))):
         wrong = compiled._Task.from_buffer_copy(task)
         setattr(wrong, name, value)
-        assert solver(wrong, film, 1, which, 1, *args, answers, state) == -1
+        assert solver(ctypes.byref(wrong), ctypes.byref(film), 1, ctypes.byref(which), 1, *given) == -1
