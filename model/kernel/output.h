@@ -41,23 +41,29 @@ static double pull_at(const Grid *grid, const Points *at, const double *test, do
 
 static void edges(Problem *problem, const Grid *grid, const Points *at, double lam, Edges *out) {
     int64_t n = grid->table->points;
-    double lnlp = problem->log_prestretch;
+    double lnlp = problem->log_prestretch, pull[2], start[2], log[6];
     Stress now;
     for (int64_t end = 0; end < 2; end++) {
         double inner = end == 0 ? exp_of(-problem->span) : 1.0;
-        double pull = pull_at(grid, at, grid->table->edge_tests + 2 * n * end, lam, inner);
-        double start = dot(n, grid->table->ends + n * end, at->log), log1 = start;
-        for (int64_t k = 0; k < 3; k++) {
-            stress_at(problem, log1, lnlp, &now);
-            double shrink = exp_of(lnlp - log1);
-            log1 += (pull - now.t1[0] * shrink) / ((now.h11[0] - now.t1[0]) * shrink);
-        }
-        if (!(fabs(log1 - start) < 0.1 + 0.5 * fabs(start - lnlp))) log1 = start;
-        stress_at(problem, log1, lnlp, &now);
-        out->log1[end] = log1;
-        out->t1[end] = now.t1[0];
-        out->t2[end] = now.t2[0];
+        pull[end] = pull_at(grid, at, grid->table->edge_tests + 2 * n * end, lam, inner);
+        out->log1[end] = start[end] = dot(n, grid->table->ends + n * end, at->log);
     }
+    for (int64_t k = 0; k < 4; k++) {
+        for (int64_t end = 0; end < 2; end++) {
+            if (k == 3 && !(fabs(out->log1[end] - start[end]) < 0.1 + 0.5 * fabs(start[end] - lnlp)))
+                out->log1[end] = start[end];
+            log[end] = out->log1[end];
+            log[2 + end] = lnlp;
+            log[4 + end] = -(out->log1[end] + lnlp);
+        }
+        stress(problem, 2, log, &now);
+        for (int64_t end = 0; end < 2 && k < 3; end++) {
+            double shrink = exp_of(lnlp - out->log1[end]);
+            out->log1[end] += (pull[end] - now.t1[end] * shrink) / ((now.h11[end] - now.t1[end]) * shrink);
+        }
+    }
+    memcpy(out->t1, now.t1, sizeof out->t1);
+    memcpy(out->t2, now.t2, sizeof out->t2);
 }
 
 /* Value and two derivatives of the Legendre series with n coefficients. */

@@ -179,7 +179,7 @@ def _solver() -> Any:
     return function
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class One:
     """One solved state."""
 
@@ -197,6 +197,17 @@ class One:
         grid = ritz.Grid.lay(modes, np.array([[-self.span], [0.0]]))
         c, w = np.array(self.state.c[:modes]), np.array(self.state.w[: modes + ritz.MORE_POINTS])
         return grid, ritz.State(c[:, None], w[:, None, None])
+
+    def attributes(self, material: Material, sensitivities: bool) -> dict[str, Any]:
+        """Attributes of `model.membrane.solve.Solution`."""
+        found = self.answer
+        values: dict[str, Any] = {name: getattr(found, name) for name in NUMBERS}
+        values["stable"] = True
+        values["field_exceeded"] = found.peak_field > (material.breakdown_field or math.inf)
+        values["stretch_exceeded"] = found.max_stretch > (material.max_stretch or math.inf)
+        values["evaluations"] = Evaluations(found.mechanical, found.electric)
+        values["dforce"] = self.dforce(material) if sensitivities else None
+        return values
 
     def dforce(self, material: Material) -> dict[str, Any]:
         """The derivatives of the force, as `model.membrane.solution.Solutions` has them."""
