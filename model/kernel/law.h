@@ -26,16 +26,53 @@ typedef struct {
     double maxwell[MOST_STATIONS];
 } Stress;
 
+#include "first_invariant.h"
+#include "gent.h"
+#include "mooney_rivlin.h"
+#include "neo_hooke.h"
 #include "ogden.h"
+#include "yeoh.h"
+
+/* How many moduli and shape parameters each law has; an Ogden series has as many of both as it has terms. */
+static int is_law(const Law *law) {
+    static const int64_t MODULI[LAWS] = {0, 1, 2, 3, 1}, SHAPES[LAWS] = {0, 0, 0, 0, 1};
+    if (law->kind < 0 || law->kind >= LAWS) return 0;
+    int64_t terms = law->kind == OGDEN ? law->moduli : 0;
+    if (law->moduli < 1 || law->moduli > MOST_PARAMETERS) return 0;
+    if (law->moduli != MODULI[law->kind] + terms || law->shapes != SHAPES[law->kind] + terms) return 0;
+    for (int64_t k = 0; k < law->moduli; k++)
+        if (!(fabs(law->mu[k]) < INFINITY)) return 0;
+    for (int64_t k = 0; k < law->shapes; k++)
+        if (!(fabs(law->alpha[k]) < INFINITY)) return 0;
+    return 1;
+}
 
 static void derivatives_of_law(const Law *law, int64_t n, const double *log, Stress *out) {
-    ogden_derivatives(law, n, log, out);
+    switch (law->kind) {
+    case NEO_HOOKE: neo_hooke_derivatives(law, n, log, out); break;
+    case MOONEY_RIVLIN: mooney_rivlin_derivatives(law, n, log, out); break;
+    case YEOH: yeoh_derivatives(law, n, log, out); break;
+    case GENT: gent_derivatives(law, n, log, out); break;
+    default: ogden_derivatives(law, n, log, out);
+    }
 }
 
 /* `sum over points of rate1 d(dW/dL1) + rate2 d(dW/dL2)` by every modulus and every shape parameter. */
 static void projected(const Law *law, int64_t n, const double *log, const double *rate1, const double *rate2,
                       double *by_mu, double *by_alpha) {
-    ogden_projected(law, n, log, rate1, rate2, by_mu, by_alpha);
+    if (law->kind == OGDEN) {
+        ogden_projected(law, n, log, rate1, rate2, by_mu, by_alpha);
+        return;
+    }
+    for (int64_t k = 0; k < law->moduli; k++) {
+        Law unit = *law; /* stresses are linear in the moduli */
+        Stress of_unit;
+        for (int64_t other = 0; other < law->moduli; other++) unit.mu[other] = other == k ? 1.0 : 0.0;
+        derivatives_of_law(&unit, n, log, &of_unit);
+        by_mu[k] = 0.0;
+        for (int64_t i = 0; i < n; i++) by_mu[k] += rate1[i] * of_unit.t1[i] + rate2[i] * of_unit.t2[i];
+    }
+    if (law->kind == GENT) by_alpha[0] = gent_by_limit(law, n, log, rate1, rate2);
 }
 
 #endif

@@ -46,17 +46,9 @@ typedef struct {
 static int is_positive(double x) { return x > 0.0 && x < INFINITY; }
 
 static int is_film(const Film *film) {
-    const Law *law = &film->law;
-    if (law->kind < 0 || law->kind >= LAWS) return 0;
-    if (law->moduli < 1 || law->moduli > MOST_PARAMETERS || law->shapes < 0 || law->shapes > MOST_PARAMETERS) return 0;
-    if (law->kind == OGDEN && law->shapes != law->moduli) return 0;
-    for (int64_t k = 0; k < law->moduli; k++)
-        if (!(fabs(law->mu[k]) < INFINITY)) return 0;
-    for (int64_t k = 0; k < law->shapes; k++)
-        if (!(fabs(law->alpha[k]) < INFINITY)) return 0;
-    return is_positive(film->disk_radius) && film->disk_radius < film->ring_radius && is_positive(film->ring_radius) &&
-           is_positive(film->thickness) && is_positive(film->prestretch) && is_positive(film->shear_modulus) &&
-           is_positive(film->eps_r) && is_positive(film->permittivity);
+    return is_law(&film->law) && is_positive(film->disk_radius) && film->disk_radius < film->ring_radius &&
+           is_positive(film->ring_radius) && is_positive(film->thickness) && is_positive(film->prestretch) &&
+           is_positive(film->shear_modulus) && is_positive(film->eps_r) && is_positive(film->permittivity);
 }
 
 /* The state in dimensionless form. */
@@ -138,6 +130,8 @@ static int64_t answer(const Task *task, const Film *film, double h, double volta
     out->iterations = found.steps;
     out->modes = grid.table->modes;
     place(film, &problem, h, voltage, &x, out);
+    if (!(fabs(out->force) + out->peak_field + fabs(out->min_hoop_stress) + out->max_stretch < INFINITY))
+        return LEFT_TO_OTHERS;
     if (task->sensitivities) {
         Reduced system;
         Step by_height;

@@ -19,9 +19,13 @@ from numpy.typing import NDArray
 
 from model.arrays import Array
 from model.kernel.library import load
+from model.material.gent import Gent
 from model.material.law import Evaluations, Law
 from model.material.materials import Material
+from model.material.mooney_rivlin import MooneyRivlin
+from model.material.neo_hooke import NeoHooke
 from model.material.ogden import Ogden
+from model.material.yeoh import Yeoh
 from model.membrane import output, ritz
 from model.membrane.flat import Flat
 from model.membrane.from_rest import CHECK_MODES
@@ -30,7 +34,7 @@ from model.specimen import Specimen
 
 MOST_MODES, MOST_PARAMETERS = 36, 8
 MOST_POINTS = MOST_MODES + ritz.MORE_POINTS
-LAWS: tuple[type[Law], ...] = (Ogden,)  # in the order of their numbers in law.h
+LAWS: tuple[type[Law], ...] = (Ogden, NeoHooke, MooneyRivlin, Yeoh, Gent)  # in the order of their numbers in law.h
 SLOPES = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
 NUMBERS = (
     *("force", "peak_field", "peak_field_radius", "min_hoop_stress", "min_meridional_stress", "max_stretch"),
@@ -167,6 +171,10 @@ def _film(specimen: Specimen) -> _Film:
     )
 
 
+# Of the kernel's function: task, films and how many, film of every state, states, h, voltage; answers, unknowns.
+ARGUMENTS = [c_void_p, c_void_p, c_int64, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p]
+
+
 @lru_cache(maxsize=1)
 def _solver() -> Any:
     """The kernel's function; None where there is no kernel."""
@@ -175,7 +183,7 @@ def _solver() -> Any:
         return None
     function = library.dea_kernel_solve
     function.restype = c_int64
-    function.argtypes = [c_void_p, c_void_p, c_int64, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p]
+    function.argtypes = ARGUMENTS
     return function
 
 

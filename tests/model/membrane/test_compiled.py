@@ -12,7 +12,11 @@ import pytest
 
 from model.arrays import Array
 from model.kernel.library import load, says
+from model.material.gent import Gent
 from model.material.materials import NAMED, Material
+from model.material.mooney_rivlin import MooneyRivlin
+from model.material.neo_hooke import NeoHooke
+from model.material.yeoh import Yeoh
 from model.membrane import compiled
 from model.membrane.solve import Solutions, Status, solve, solve_many
 from model.specimen import Specimen
@@ -105,6 +109,34 @@ def test_the_kernel_has_the_digits_of_the_path_for_arrays(wrinkling: str, tolera
             mine.dforce[name] / size, slopes / size, rtol=1e-9, atol=1e-9, err_msg=name, equal_nan=True
         )
     assert 0 < mine.evaluations.electric < mine.evaluations.mechanical <= theirs.evaluations.mechanical
+
+
+LAWS = {
+    "neo_hooke": (NeoHooke, (6e4,), ()),
+    "mooney_rivlin": (MooneyRivlin, (4e4, 8e3), ()),
+    "yeoh": (Yeoh, (3e4, -5e2, 40.0), ()),
+    "gent": (Gent, (7e4,), (25.0,)),
+    "gent, short chains": (Gent, (9e4,), (4.0,)),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_every_law_has_the_digits_of_the_path_for_arrays(name: str) -> None:
+    law, mu, alpha = LAWS[name]
+    film = Specimen(4e-3, 20e-3, 60e-6, 1.3, Material(name, mu, alpha, 2.5, law=law))
+    h, voltage = np.linspace(1e-3, 12e-3, 8), np.linspace(0.0, 800.0, 8)
+    assert all(
+        compiled.solve_one(film, *state, tolerance=1e-8, relaxed=True, sensitivities=False) is not None
+        for state in zip(h.tolist(), voltage.tolist(), strict=True)
+    )
+    mine, theirs = both(film, h, voltage, sensitivities=True)
+    np.testing.assert_array_equal(mine.status, theirs.status)
+    for one in NUMBERS:
+        np.testing.assert_allclose(getattr(mine, one), getattr(theirs, one), rtol=1e-11, atol=1e-9, err_msg=one)
+    assert mine.dforce is not None
+    assert theirs.dforce is not None
+    for one, slopes in theirs.dforce.items():
+        np.testing.assert_allclose(mine.dforce[one], slopes, rtol=1e-10, err_msg=one)
 
 
 def test_order_and_company_change_no_bit() -> None:
