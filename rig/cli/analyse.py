@@ -78,6 +78,37 @@ def breakdown(
     tell_written(out, plot)
 
 
+@command.command("cycles")
+@click.argument("logs", type=FILE, nargs=-1, required=True)
+@click.option("-o", "--out", type=FILE, help="One row a cycle as CSV or Parquet, by the ending; units in the headings.")
+@click.option("--plot", type=FILE, help="Peak force, response and loop area over the cycles: SVG or PNG.")
+@click.option("--step", type=click.IntRange(min=1), help="Step of the protocol. Absent: the only one that cycles.")
+def cycles(logs: tuple[Path, ...], out: Path | None, plot: Path | None, step: int | None) -> None:
+    """Every cycle of LOGS: those of a run and of the runs that went on with it; each must be there once."""
+    from rig.analysis.cycles import as_table, read_cycles
+    from rig.base.errors import ConfigError
+    from rig.base.outputs import check_new
+    from rig.cli.show import show
+    from rig.log.export import check_format, write_table
+
+    check_new(out, plot)
+    if out is not None:
+        check_format(out)
+    if plot is not None and plot.suffix.lower() not in (".svg", ".png"):
+        raise ConfigError(f"{plot}: a picture ends in .svg or .png.")
+    found = read_cycles(logs, step)
+    show(as_table(found))
+    for line in found.remarks:
+        click.echo(line)
+    if out is not None:
+        write_table(found.columns, out)
+    if plot is not None:
+        from rig.analysis.cycles_picture import draw
+
+        draw(found, plot)
+    tell_written(out, plot)
+
+
 def _fits(table: Breakdowns, found: Study) -> Table:
     from rich.table import Table
 

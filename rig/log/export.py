@@ -33,9 +33,19 @@ def export(path: Path, out: Path, topic: str | None = None) -> int:
     LogError
         The log cannot be read, ``out`` exists, has another ending, or cannot be written.
     """
+    check_format(out)
+    return write_table(_run_table(load_run(path)) if topic is None else _topic_table(read_log(path), topic), out)
+
+
+def check_format(out: Path) -> None:
+    """Raise `UnusableFile` when the ending of ``out`` says no format."""
     if out.suffix not in FORMATS:
         raise UnusableFile(out, "has an ending that says no known format", f"Allowed: {' and '.join(FORMATS)}.")
-    table = _run_table(load_run(path)) if topic is None else _topic_table(read_log(path), topic)
+
+
+def write_table(table: Columns, out: Path) -> int:
+    """Write columns of one length to ``out``, as `export` does; how many rows they have."""
+    check_format(out)
     rows = len(next(iter(table.values())))
     file = PartFile(out)
     try:
