@@ -217,6 +217,16 @@ class SupplySettings(InstrumentSettings):
     parallel_capacitance_nF: NotNegative = Field(
         default=0.0, description="Capacitance of cable and output beside the film (nF), charged as well."
     )
+    parallel_capacitance_uncertainty_nF: NotNegative | None = Field(
+        default=None,
+        description="Standard uncertainty (k = 1) of parallel_capacitance_nF (nF). 0 means exact. Default: 5 % of it "
+        "and at least 0.01 nF, assumed.",
+    )
+    current_uncertainty_percent: NotNegative | None = Field(
+        default=None,
+        description="Standard uncertainty (k = 1) of the gain of the measured current, % of the reading. 0 means "
+        "exact. Default: 1, assumed.",
+    )
 
 
 Quantity = Literal["voltage", "temperature", "humidity"]

@@ -12,6 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from calibration.electrical.charge import ByCharge
 from calibration.film.curve import Curve
 from calibration.film.reduction import select
 from calibration.film.result import Identification
@@ -29,6 +30,7 @@ def write_report(
     provenance: Mapping[str, Any],
     truth: Material | None = None,
     comparison: Sequence[Identification] = (),
+    charge: ByCharge | None = None,
 ) -> None:
     """Write the report of an identification as one self-contained HTML file.
 
@@ -46,6 +48,8 @@ def write_report(
         The film of a simulation, to be held against what was found.
     comparison : sequence of Identification, optional
         The same data with other numbers of Ogden terms (`calibration.film.identify.compare`).
+    charge : ByCharge, optional
+        The permittivity by the charge, where it is held at that.
 
     Raises
     ------
@@ -53,7 +57,8 @@ def write_report(
         When the file cannot be written.
     """
     selections = select(curves, identification.material, identification.wrinkling)
-    page = render(ReportData(identification, curves, selections, scene_texts, provenance, truth, comparison))
+    data = ReportData(identification, curves, selections, scene_texts, provenance, truth, comparison, charge)
+    page = render(data)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     try:
         with open(handle, "w", encoding="utf-8") as file:  # noqa: PTH123 # a descriptor, not a path

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.electrical.charge import ByCharge, charge_as_json
 from calibration.film.between import Spread, between, by_specimen, identify_each
 from calibration.film.cards import CardError, material_cards
 from calibration.film.curve import Curve, CurveError
@@ -56,6 +57,7 @@ class Found:
     notes: list[str]
     comparison: list[Identification] = field(default_factory=list)
     spreads: dict[str, Spread] = field(default_factory=dict)
+    charge: ByCharge | None = None  # where the permittivity is that of the charge
     scene_texts: dict[str, str] = field(default_factory=dict)  # beside those of the runs: scenes given with tables
 
 
@@ -316,6 +318,7 @@ def write_results(found: Found, fit: Path | None, report: Path | None) -> None:
                 provenance=found.provenance,
                 truth=found.truth,
                 comparison=found.comparison,
+                charge=found.charge,
             )
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}.") from None
@@ -328,6 +331,8 @@ def _as_json(found: Found) -> str:
         values["comparison"] = [
             {name: one.to_dict()[name] for name in ("terms", "aicc", "bic", "held_out")} for one in found.comparison
         ]
+    if found.charge is not None:
+        values["charge"] = charge_as_json(found.charge)
     if found.spreads:
         values["between_specimens"] = {name: one.to_dict() for name, one in found.spreads.items()}
     return json.dumps(values, indent=2, allow_nan=False) + "\n"

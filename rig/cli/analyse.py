@@ -1,4 +1,4 @@
-"""``dea-rig analyse``: statistics over many specimens."""
+"""``dea-rig analyse``: breakdown, endurance and charge of films, from logs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @click.group("analyse")
 def command() -> None:
-    """Statistics over many specimens."""
+    """Breakdown of many specimens, cycles of one, permittivity by its charge."""
 
 
 @command.command("breakdown")
@@ -107,6 +107,26 @@ def cycles(logs: tuple[Path, ...], out: Path | None, plot: Path | None, step: in
 
         draw(found, plot)
     tell_written(out, plot)
+
+
+@command.command("charge")
+@click.argument("logs", type=FILE, nargs=-1, required=True)
+@click.option("-o", "--out", type=FILE, help="All numbers as JSON, in SI units.")
+def charge(logs: tuple[Path, ...], out: Path | None) -> None:
+    """Permittivity and leakage of one film from the current that charges it while the voltage rises in LOGS."""
+    import json
+
+    from calibration.electrical.charge import charge_as_json
+    from rig.analysis.charge import as_tables, permittivity_of
+    from rig.base.outputs import check_new, write_text
+    from rig.cli.show import show
+
+    check_new(out)
+    found = permittivity_of(logs)
+    show(as_tables(found))
+    if out is not None:
+        write_text(out, json.dumps(charge_as_json(found), indent=2, allow_nan=False) + "\n")
+    tell_written(out)
 
 
 def _fits(table: Breakdowns, found: Study) -> Table:

@@ -50,6 +50,13 @@ LEAST_SHARE = 0.01  # of a variance, for a line in the budget on screen
     type=click.Choice(["eps-stretch", "softening", "voltage-loss", "zero-drift"]),
     help="An error to be fitted along within its usual size. May be repeated.",
 )
+@click.option(
+    "--permittivity",
+    type=click.Choice(["force", "charge"]),
+    default="force",
+    show_default=True,
+    help="By what: with charge the current that charges one film says it, whatever the film's stiffness does.",
+)
 @click.option("--stiffness-at", help="Stretches of the stiffness that can be compared between runs, e.g. 1.5,1.2.")
 @click.option("--cards", type=FOLDER, help="Folder for material cards of Abaqus, Ansys, COMSOL and FEBio.")
 @import_options(cone=True)
@@ -67,6 +74,7 @@ def command(
     fixed: tuple[str, ...],
     negative_exponents: bool,
     along: tuple[str, ...],
+    permittivity: str,
     stiffness_at: str | None,
     cards: Path | None,
     dry_run: bool,
@@ -91,6 +99,8 @@ def command(
     logs = _of_folders(logs)
     options = taken(words)
     _check_source(logs, scene, given(options) or dry_run or tidy is not None)
+    if scene is not None and permittivity == "charge":
+        raise click.UsageError("--permittivity charge needs logs: tables have no current.")
     tables = None
     if scene is not None:
         from rig.analysis.imported import identify_cones, read_cones
@@ -120,6 +130,10 @@ def command(
         }
         if tables is not None and scene is not None:
             found = identify_cones(tables, logs, scene, **settings)
+        elif permittivity == "charge":
+            from rig.analysis.charged_film import identify_with_charge
+
+            found = identify_with_charge(list(logs), **settings)
         else:
             found = identify_logs(list(logs), **settings)
     write_results(found, out, report)

@@ -52,6 +52,8 @@ iseg-edcp    boot_s                  10.0      0      60
 iseg-edcp    bitrate                 125000    (0     -
 iseg-edcp    ramp_V_per_s            100.0     (0     -
 iseg-edcp    parallel_capacitance_nF 0.0       0      -
+iseg-edcp    parallel_capacitance_uncertainty_nF None 0 -
+iseg-edcp    current_uncertainty_percent None 0 -
 iseg-edcp    module                  0         0      63
 iseg-edcp    channel                 0         0      23
 iseg-edcp    max_ramp_percent_per_s  20.0      (0     100
@@ -61,12 +63,16 @@ shvps        boot_s                  10.0      0      60
 shvps        baud                    115200    (0     -
 shvps        ramp_V_per_s            100.0     (0     -
 shvps        parallel_capacitance_nF 0.0       0      -
+shvps        parallel_capacitance_uncertainty_nF None 0 -
+shvps        current_uncertainty_percent None 0 -
 shvps        poll_rate_Hz            10.0      (0     20
 labjack-amplifier     timeout_s                0.25  (0  10
 labjack-amplifier     boot_s                   10.0  0   60
 labjack-amplifier     tcp_port                 502   1   65535
 labjack-amplifier     ramp_V_per_s             100.0 (0  -
 labjack-amplifier     parallel_capacitance_nF  0.0   0   -
+labjack-amplifier     parallel_capacitance_uncertainty_nF None 0 -
+labjack-amplifier     current_uncertainty_percent None 0 -
 labjack-amplifier     gain_V_per_V             None  (0  -
 labjack-amplifier     voltage_monitor_V_per_V  None  (0  -
 labjack-amplifier     current_monitor_uA_per_V None  (0  -

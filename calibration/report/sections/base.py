@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from calibration.electrical.charge import ByCharge
 from calibration.film.curve import Curve
 from calibration.film.propagation import secant_modulus, sorted_terms
 from calibration.film.reduction import Selection
@@ -67,7 +68,7 @@ class ReportData:
     """Everything that a section may show.
 
     ``truth`` is the film of a simulation, ``comparison`` the same data with other numbers of terms, ``scene_texts``
-    name and text of each scene, ``provenance`` whatever identifies the data.
+    name and text of each scene, ``provenance`` whatever identifies the data, ``charge`` the permittivity by the charge.
     """
 
     identification: Identification
@@ -77,6 +78,7 @@ class ReportData:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     truth: Material | None = None
     comparison: Sequence[Identification] = ()
+    charge: ByCharge | None = None
 
     @cached_property
     def known(self) -> dict[str, float]:
