@@ -11,6 +11,7 @@ import numpy as np
 
 from calibration.electrical.charge import Charging, Known, NotResolved, Permittivity, permittivity
 from calibration.film.assumed import assumed_uncertainties
+from calibration.rounding import percent
 from drivers.roles import HVFlag
 from rig.base.errors import DataError
 from rig.base.toml_file import parse_table
@@ -115,8 +116,6 @@ def as_tables(found: Permittivity) -> Group:
     """Permittivity with its budget, capacitances and leakages, for the terminal."""
     from rich.console import Group
     from rich.table import Table
-
-    from calibration.rounding import percent
 
     budget = Table(title=f"Relative permittivity {found.value:.4g} +- {found.standard_uncertainty:.2g} by the charge")
     budget.add_column("part of the uncertainty")
