@@ -172,7 +172,7 @@ def _film(specimen: Specimen) -> _Film:
 
 
 # Of the kernel's function: task, films and how many, film of every state, states, h, voltage; answers, unknowns.
-ARGUMENTS = [c_void_p, c_void_p, c_int64, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p]
+ARGUMENTS: list[Any] = [c_void_p, c_void_p, c_int64, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p]
 
 
 @lru_cache(maxsize=1)
