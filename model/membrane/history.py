@@ -38,6 +38,7 @@ MORE_MODES = 2  # than an elastic film of the same tolerance: the viscous strain
 FEW = 5  # answers within a step that are solved each; of more, so many are solved at first
 MOST_NODES = 65
 CHUNK = 256  # states that are solved at once
+LEAST_SHARE = 0.05  # of the tolerance: no less is stated of an error, for between steps it is not that of their ends
 PEAK, HOOP, MERIDIONAL = 1, 2, 3  # rows of an answer, after the force
 
 
@@ -145,7 +146,7 @@ def solve_histories(
                 answers[k].steps = int(trail.taken[place]), int(trail.rejected[place])
             lost |= {mine[place]: how for place, how in trail.lost.items()}
             _Reader(films, courses, trail, times, some, goal(tolerance, sensitivities), tolerance * scale).read()
-    return [answers[k].history(specimen, *checked[k], lost.get(k)) for k, specimen in enumerate(specimens)]
+    return [answers[k].history(specimen, *checked[k], lost.get(k), tolerance) for k, specimen in enumerate(specimens)]
 
 
 def _columns(specimen: Specimen) -> int:
@@ -236,7 +237,9 @@ class _Answer:
         status = np.where(wrinkled, Status.WRINKLED, Status.TAUT)
         self.status[asked] = np.where(np.isfinite(rows[0]), status, Status.NOT_CONVERGED)
 
-    def history(self, specimen: Specimen, course: Course, times: Array, lost: tuple[float, Status] | None) -> History:
+    def history(
+        self, specimen: Specimen, course: Course, times: Array, lost: tuple[float, Status] | None, tolerance: float
+    ) -> History:
         """Everything with its units, the error over the largest force of the history."""
         if lost is not None:
             self.status[times > lost[0]] = lost[1]
@@ -258,7 +261,7 @@ class _Answer:
             min_hoop_stress=shear * rows[HOOP],
             min_meridional_stress=shear * rows[MERIDIONAL],
             status=self.status,
-            error_estimate=np.where(answered, self.error * self.scale / largest, np.nan),
+            error_estimate=np.where(answered, self.error * self.scale / largest + LEAST_SHARE * tolerance, np.nan),
             steps=self.steps[0],
             rejected=self.steps[1],
             dforce=slopes,
