@@ -134,7 +134,34 @@ class Film:
         least = -shear * largest(-s2)
         return Result(force, peak, least, True, "solved", evaluations, start, seconds)
 
+    def power_law(self, radius: Array) -> Array:
+        """First guess of (ln l1, ln l2, theta, z): ``r = R`` and slopes ``dz/dR ~ R^(-1/n)``, shape (4, points).
+
+        ``R S1 sin(theta)`` is the same at every radius; n is the logarithmic derivative of ``S1 sin(theta)`` by the
+        slope, at the mean slope (1 where the film has no tension there).
+        """
+        mean = self.height / (1.0 - self.disk)
+        mean_l1 = np.array([self.lp * math.hypot(1.0, mean)])
+        l2 = np.array([self.lp])
+        (s1,), _ = self.stresses(mean_l1, l2)
+        (s11,), _, _ = self.stiffness(mean_l1, l2)
+        part = mean * mean / (1.0 + mean * mean)  # d ln(l1) / d ln(slope); S1 sin(theta) = s1 slope / (l1^2 / lp)
+        power = 1.0 - 2.0 * part + part * s11 / s1 if s1 > 0.0 else 1.0
+        power = power if power > 0.5 else 1.0
+
+        def rise(at: Array) -> Array:
+            """The integral of ``R^(-1/n)`` from the disk."""
+            if abs(power - 1.0) < 1e-9:
+                return np.log(at / self.disk)
+            exponent = 1.0 - 1.0 / power
+            return np.asarray((at**exponent - self.disk**exponent) / exponent)
+
+        scale = self.height / float(rise(np.ones(1))[0])
+        slope = scale * radius ** (-1.0 / power)
+        l1 = self.lp * np.hypot(1.0, slope)
+        return np.stack([np.log(l1), np.full_like(l1, math.log(self.lp)), np.arctan(slope), scale * rise(radius)])
+
     def cone(self) -> tuple[float, float]:
-        """Meridional stretch and slope of a straight cone: the natural first guess."""
+        """Meridional stretch and slope of a straight cone: the plainest guess."""
         slope = self.height / (1.0 - self.disk)
         return self.lp * math.hypot(1.0, slope), math.atan(slope)

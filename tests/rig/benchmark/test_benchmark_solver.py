@@ -6,6 +6,8 @@ import csv
 import io
 import json
 import math
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,12 @@ from model.material.materials import NAMED
 from model.membrane import solve as membrane
 from model.specimen import Specimen
 from model.verification import baselines
-from rig.benchmark import cases, extremes, solver
+from rig.benchmark import cases, extremes, ratios, solver
+
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "rig" / "benchmark" / "README.md").read_text(encoding="utf-8")
+PICTURES = ROOT / "sim_fixtures" / "pictures"
+QUOTED = re.compile(r"one film alone, against solve_bvp in ln R +([0-9.]+) \(")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +76,7 @@ def test_the_tables_name_methods_and_ratios(report: solver.Report) -> None:
     console = Console(width=160, record=True, file=io.StringIO())
     console.print(solver.render(report))
     text = console.export_text()
-    for wanted in ("DOP853 shooting", "cold single against solve_bvp in ln R", "numpy"):
+    for wanted in ("DOP853 shooting", "one film alone, against solve_bvp in ln R", "load before", "numpy"):
         assert wanted in text
 
 
@@ -77,11 +84,46 @@ def test_the_tables_name_methods_and_ratios(report: solver.Report) -> None:
 def test_curves_wrinkled_films_and_one_off_costs_are_measured_too() -> None:
     report = solver.measure(cases=3, methods=["DOP853 shooting"], batch=50, rounds=1)
     assert {speed.mode for speed in report.speeds} == {"cold single", "batch", "sweep"}
-    assert any(ratio.what.startswith("wrinkled over taut") for ratio in report.ratios)
-    assert all(0 < ratio.value < math.inf for ratio in report.ratios)
+    assert sum(ratio.what.startswith("wrinkled film over taut one") for ratio in report.ratios) == 2
+    assert all(0 < ratio.low <= ratio.median <= ratio.high < math.inf for ratio in report.ratios)
     assert [row.states for row in report.scaling] == [10, 100, 1000, 10_000]
     assert max(row.peak_memory_MB for row in report.scaling) < 500
     assert all(seconds > 0 for seconds in report.one_off.values())
+
+
+def test_a_ratio_is_the_median_of_rounds_between_their_quartiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = 0.0
+
+    def busy(durations: list[float]) -> Callable[[], None]:
+        def job() -> None:
+            nonlocal clock
+            clock += durations.pop(0)
+
+        return job
+
+    monkeypatch.setattr(ratios, "process_time", lambda: clock)
+    dear = [busy([2.0, 9.0, 3.0, 9.0, 4.0, 9.0, 5.0, 9.0, 60.0, 70.0]), busy([4.0] * 10), busy([1.0] * 10)]
+    found = ratios.measured("it", dear, [busy([1.0] * 10) for _ in range(3)], 5)
+    assert (found.low, found.median, found.high, found.rounds) == (3.0, 4.0, 4.0, 5)
+    together = ratios.measured("it", [busy([2.0] * 3), busy([4.0] * 3)], [busy([0.5] * 3)], 3, states=10, repeats=1)
+    assert together.median == 60.0
+    assert "it" in ratios.lines([found], ["On: a desk."]) and "5 rounds" in ratios.lines([found], [])
+
+
+def test_the_page_quotes_what_the_command_printed() -> None:
+    printed = (PICTURES / "solver_ratios.txt").read_text(encoding="utf-8")
+    assert printed in PAGE
+    assert QUOTED.search(printed) and "load before" in printed and "membrane solver" in printed
+
+
+@pytest.mark.slow
+def test_the_quoted_ratio_is_what_one_finds() -> None:
+    """On any machine, within a factor of two: ratios are measured side by side."""
+    found = solver.measure(cases=8, methods=["solve_bvp in ln R"], batch=100, rounds=1, details=False)
+    quoted = QUOTED.search(PAGE)
+    assert quoted is not None
+    assert found.ratios[0].what == "one film alone, against solve_bvp in ln R"
+    assert 0.5 < found.ratios[0].median / float(quoted[1]) < 2.0
 
 
 def test_a_method_that_fails_is_counted_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
