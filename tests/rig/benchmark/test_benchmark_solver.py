@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from model.kernel import library
 from model.material.materials import NAMED
 from model.membrane import solve as membrane
 from model.specimen import Specimen
@@ -119,6 +120,8 @@ def test_the_page_quotes_what_the_command_printed() -> None:
 @pytest.mark.slow
 def test_the_quoted_ratio_is_what_one_finds() -> None:
     """On any machine, within a factor of two: ratios are measured side by side."""
+    if library.load() is None:
+        pytest.skip("the quoted ratios are those of the compiled kernel")
     found = solver.measure(cases=8, methods=["solve_bvp in ln R"], batch=100, rounds=1, details=False)
     quoted = QUOTED.search(PAGE)
     assert quoted is not None
