@@ -25,7 +25,7 @@ from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
 from rig.base.outputs import write_text
 from rig.base.toml_file import parse_table
-from rig.log.contents import IN_MEMORY, bench_of, bench_word, session_in
+from rig.log.contents import IN_MEMORY, air_in, bench_of, bench_word, session_in
 from rig.log.dataset import CurveErrors, Run, SpecimenErrors, load_run
 from rig.log.notes import notes_on
 from rig.log.reader import Log
@@ -282,6 +282,8 @@ def _certificate_problems(run: Run) -> list[str]:
 def said_in(logs: Sequence[Log]) -> dict[str, dict[str, object]]:
     """What people said of ``logs``, by path: ``session`` of their scenes and ``notes`` beside them, if there are any.
 
+    What was measured of the air stands with the session.
+
     Raises
     ------
     ConfigError
@@ -290,7 +292,7 @@ def said_in(logs: Sequence[Log]) -> dict[str, dict[str, object]]:
     found: dict[str, dict[str, object]] = {"session": {}, "notes": {}}
     for log in logs:
         notes = [f"{note.written} {note.by}: {note.text}" for note in notes_on(log.path)]
-        for kind, said in (("session", session_in(log)), ("notes", notes)):
+        for kind, said in (("session", session_in(log) | air_in(log)), ("notes", notes)):
             if said:
                 found[kind][str(log.path)] = said
     return {kind: said for kind, said in found.items() if said}

@@ -65,6 +65,7 @@ class Outlook:
             field=field,
             nearest=nearest,
             nearest_part=known.get(nearest, math.nan),
+            second=recorder.monitors["voltage"].value if "voltage" in recorder.monitors else math.nan,
         )
 
     def _field(self, displacement: float, voltage: float) -> float:

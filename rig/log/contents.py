@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from drivers.instrument import MONITORS
 from drivers.roles import Identity
 from rig.base.certificates import parse_certificate
@@ -24,6 +26,13 @@ REPLAY_OF = "replay of "
 
 # Older logs say it in one sentence. A model may hold commas; serial number and firmware do not.
 _SAID = re.compile(r"model (.*), serial ([^,;]*), firmware ([^,;]*)(?:;|$)")
+
+
+AIR = (
+    ("temperature_K", "measured_temperature_C", 1.0, -273.15),
+    ("relative_humidity", "measured_humidity_percent", 100.0, 0.0),
+)
+"""Of a monitor's field: its name beside those of ``[session]``, and what makes that unit of it."""
 
 
 def bench_of(log: Log) -> str:
@@ -54,6 +63,18 @@ def session_in(log: Log) -> dict[str, str]:
         return {}
     session = said.get("session")
     return {key: str(value) for key, value in session.items()} if isinstance(session, dict) else {}
+
+
+def air_in(log: Log) -> dict[str, str]:
+    """What monitors measured of the air at the film: mean, lowest and highest, in the units of ``[session]``."""
+    found = {}
+    topics = [f"/{name}/sample" for name in MONITORS if f"/{name}/sample" in log.topics]
+    for columns in log.tables(topics).values():
+        for field, key, scale, zero in AIR:
+            values = columns[field][np.isfinite(columns[field])] * scale + zero
+            if values.size:
+                found[key] = f"{values.mean():.1f} ({values.min():.1f} to {values.max():.1f})"
+    return found
 
 
 def certificates_in(log: Log) -> dict[str, Certificate]:

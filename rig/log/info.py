@@ -9,7 +9,7 @@ import numpy as np
 
 from rig.base.errors import ConfigError
 from rig.base.text import printable
-from rig.log.contents import identities_in, session_in
+from rig.log.contents import air_in, identities_in, session_in
 from rig.log.notes import notes_on
 from rig.log.reader import Log, read_log
 from rig.log.schema import ROLES
@@ -25,7 +25,7 @@ def info(path: Path) -> str:
     log = read_log(path)
     lines = [f"{path}: {_state(log)}", ""]
     lines += _table("run", log.metadata.get("run", {}))
-    lines += _table("session", session_in(log))
+    lines += _table("session", session_in(log) | air_in(log))
     lines += [_row("began", _date(log.start_ns)), _row("lasted", f"{(log.end_ns - log.start_ns) * 1e-9:.3f} s")]
     lines += _table("outcome", log.outcome if log.outcome is not None else {"status": "not recorded"})
     lines += _notes(path)

@@ -22,6 +22,8 @@ class Status:
         What is being done, or what the operator is waited for.
     force, displacement, voltage, current, field : float
         N, m, V, A, V/m; measured but for the field, which is the model's at the measured displacement and voltage.
+    second : float
+        Second reading of the voltage (V).
     nearest : str
         The limit that is nearest.
     nearest_part : float
@@ -40,6 +42,7 @@ class Status:
     field: float = math.nan
     nearest: str = ""
     nearest_part: float = math.nan
+    second: float = math.nan
 
     def line(self, width: int, before: str = "") -> str:
         """On one line of at most ``width`` characters, cut between words; ``before`` says on what bench."""
@@ -68,6 +71,8 @@ class Status:
             for value, scale, unit, digits in values
             if math.isfinite(value)
         ]
+        if math.isfinite(self.second):
+            known.append(f"second reading {round(self.second) + 0.0:.0f} V")
         if self.nearest and math.isfinite(self.nearest_part):
             known.append(f"{self.nearest} at {100 * self.nearest_part:.0f} % of its limit")
         return ", ".join(known)

@@ -17,8 +17,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from drivers.instrument import MONITORS
 from drivers.roles import HVFlag
 from rig.base.errors import RigError
+from rig.log.contents import AIR
 from rig.log.errors import LogError
 from rig.log.follow import Follower, News
 from rig.log.reader import Columns
@@ -36,6 +38,7 @@ OUTLOOK_LIMIT_S = 120.0
 TOPICS = (
     *("/reference", "/phase", "/stage/sample", "/force/sample", "/displacement/sample", "/hv/sample"),
     *("/event", "/target"),
+    *(f"/{name}/sample" for name in MONITORS),
 )
 
 
@@ -198,6 +201,11 @@ class RunView:
         self._latest["setpoint_V"] = _finite(float(new["setpoint_V"][-1]))
         self._flags = HVFlag(int(new["flags"][-1]))
 
+    def _take_monitor(self, new: Columns) -> None:
+        for field, name, scale, zero in (("voltage_V", "second_V", 1.0, 0.0), *AIR):
+            if np.isfinite(new[field]).any():
+                self._latest[name] = _finite(float(new[field][-1]) * scale + zero)
+
     def _take_phase(self, new: Columns) -> None:
         for k in range(len(new["t_s"])):
             kind = str(new["kind"][k])
@@ -238,6 +246,7 @@ class RunView:
         "/phase": _take_phase,
         "/event": _take_event,
         "/target": _take_target,
+        **dict.fromkeys((f"/{name}/sample" for name in MONITORS), _take_monitor),
     }
 
     def _add(self, name: str, t: np.ndarray[Any, Any], value: np.ndarray[Any, Any]) -> None:
@@ -270,7 +279,7 @@ class RunView:
             return State.SAFE  # as measured at the end; the flags of the last sample may be older than that
         if voltage is None or (outcome is None and self.age > OLD_S):
             return State.UNKNOWN
-        if abs(voltage) >= SAFE_VOLTAGE:
+        if max(abs(voltage), abs(self._latest.get("second_V") or 0.0)) >= SAFE_VOLTAGE:
             return State.LIVE
         if HVFlag.ON in self._flags or (self._latest.get("setpoint_V") or 0.0) > 0.0:
             return State.ARMED

@@ -27,6 +27,9 @@ NUMBERS = {
     "displacement_mm": ("displacement", "mm"),
     "voltage_V": ("voltage", "V"),
     "current_uA": ("current", "uA"),
+    "second_V": ("second reading", "V"),
+    "measured_temperature_C": ("air", "C"),
+    "measured_humidity_percent": ("humidity", "%"),
 }
 
 
