@@ -133,10 +133,14 @@ def rounded(value: float, *, down: bool = False) -> float:
     return float(f"{(math.floor if down else round)(value / step) * step:.6g}")
 
 
-def simulated_instruments(*, hv: bool, displacement: bool) -> Instruments:
-    """The instruments of the simulated bench, by role."""
+def simulated_instruments(*, hv: bool, displacement: bool, monitor: str = "") -> Instruments:
+    """The instruments of the simulated bench, by role; ``monitor`` is the driver of a second reading of the voltage."""
     roles = [role for role in DRIVERS if (role != "displacement" or displacement) and (role != "hv" or hv)]
-    return {role: {"driver": DRIVERS[role]} for role in roles}
+    made: Instruments = {role: {"driver": DRIVERS[role]} for role in roles}
+    if monitor:
+        factor = of_role("monitor")[monitor].truth().units_per_number  # type: ignore[call-arg]
+        made["monitor"] = {"driver": monitor, "quantity": "voltage", "factor": factor}
+    return made
 
 
 def scene_text(film: Film, reach: Extent, instruments: Instruments, *, real: bool = False) -> str:
@@ -169,10 +173,10 @@ def scene_text(film: Film, reach: Extent, instruments: Instruments, *, real: boo
         "hv": {"ramp_V_per_s": 300.0, "certificate": "certificates/hv.toml"},
     }
     for role, keys in instruments.items():
-        if role == "hv" and not volts:
+        if role in ("hv", "monitor") and not volts:
             continue
         settings = instrument(role, str(keys["driver"])).settings
-        usual = {key: value for key, value in given[role].items() if key in settings.model_fields}
+        usual = {key: value for key, value in given.get(role, {}).items() if key in settings.model_fields}
         parts.append(commented(f"[{role}]", settings, {**keys, **usual}))
     if real:
         return "\n".join(parts)

@@ -52,13 +52,14 @@ PORTS = click.option(
 def read_ports(path: Path | None) -> dict[str, dict[str, Any]] | None:
     """The ports by role that `dea-rig sim` printed; None for no file."""
     from rig.base.errors import ConfigError
+    from rig.sim.truth import ROLES
 
     if path is None:
         return None
     ports = read_json(path, "ports")
     if not isinstance(ports, dict) or not all(isinstance(value, dict) for value in ports.values()):
         raise ConfigError(f"{path}: not the JSON that `dea-rig sim` prints: a table of ports by role is needed.")
-    known = ("stage", "force", "displacement", "hv")
+    known = ROLES
     if unknown := sorted(ports.keys() - {*known, "served_by"}):
         from difflib import get_close_matches
 

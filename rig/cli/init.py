@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 @click.option("--name", default="film-1", show_default=True, help="Of this specimen.")
 @click.option("--no-hv", is_flag=True, help="A bench without high voltage.")
 @click.option("--no-laser", is_flag=True, help="A bench without a displacement sensor.")
+@click.option("--monitor", help="Also a second reading of the voltage by this driver, e.g. scpi.")
 @click.option("--from-devices", is_flag=True, help="A real bench: find the instruments, write ports and serials.")
 @click.option("--port", "ports", multiple=True, help="With --from-devices: look on this serial port only.")
 @click.option("--bus", "buses", multiple=True, metavar="INTERFACE:CHANNEL[@BITRATE]", help="And on this CAN bus.")
@@ -37,6 +38,7 @@ def command(
     name: str,
     no_hv: bool,
     no_laser: bool,
+    monitor: str | None,
     from_devices: bool,
     ports: tuple[str, ...],
     buses: tuple[str, ...],
@@ -50,7 +52,15 @@ def command(
     from rig.analysis.first_bench import Film, simulated_instruments
     from rig.base.errors import ConfigError
     from rig.scene.presets import PRESETS
+    from rig.sim.twins import of_role
 
+    if monitor and monitor not in of_role("monitor"):
+        raise ConfigError(f"--monitor {monitor}: there is no such driver; there are {', '.join(of_role('monitor'))}.")
+    if monitor and (no_hv or from_devices):
+        raise ConfigError(
+            "--monitor goes with a simulated bench that has high voltage. For a real one write [monitor] by hand: "
+            f"`dea-rig keys {monitor}`."
+        )
     if folder.exists():
         raise ConfigError(f"{folder} exists already; nothing is overwritten. Name a new folder.")
     if not folder.absolute().parent.is_dir():
@@ -79,7 +89,7 @@ def command(
         prestretch=asked("Pre-stretch, 1 is none", prestretch, known.prestretch),
     )
     _check(film)
-    instruments = simulated_instruments(hv=not no_hv, displacement=not no_laser)
+    instruments = simulated_instruments(hv=not no_hv, displacement=not no_laser, monitor=monitor or "")
     if from_devices:
         instruments = _found(
             ports, buses, [role for role in ("stage", "force", "displacement", "hv") if role in instruments]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from drivers.instrument import role_of
 from drivers.settings import CanSettings
 from rig.scene.scene import Scene
 
@@ -23,7 +24,7 @@ def others_on_its_ports(scene: Scene) -> Iterator[str]:
         else:
             where = getattr(table, "port", None) or ""
             found = discover(clock, [where], []) if where else []
-        if any((one.role, one.driver) == (role, table.driver) for one in found):
+        if any((one.role, one.driver) == (role_of(role), table.driver) for one in found):
             continue
         for one in found:
             if one.role:

@@ -16,7 +16,7 @@ from rig.bench.bench import Bench
 from rig.engine.follows import ForceFollows
 from rig.log.recorder import Recorder
 from rig.safety.guard import SAFE_VOLTAGE, AnyGuard, GuardState, flag_names
-from rig.safety.limits import ZERO_PART, Limits
+from rig.safety.limits import ZERO_PART, Limits, StretchLimit
 
 # Fresh data or stop. A device may miss two of its periods and take its time-out more (`timeout_s` in the scene: what
 # its wire and the host may delay one answer; one lost answer is asked again after it). A turn of the loop that took
@@ -55,6 +55,7 @@ class Watch:
         self._agreed = -math.inf
         self._seen_off = False
         self._follows = ForceFollows(bench.scene, limits)
+        self._stretch = StretchLimit(bench.scene.specimen.specimen(), limits)
 
     def sample(self, role: str, sample: Sample, now: float) -> None:
         """Judge one sample, as the recorder gave it back."""
@@ -95,6 +96,7 @@ class Watch:
             return
         if not recorder.has_laser:
             self._limits.displacement.check(recorder.displacement, "Displacement measured")
+        self._stretch.check(recorder.displacement, "Film, at the displacement measured")
         self._compare_stage_and_laser(now)
 
     def _good(self, role: str, sample: ForceSample | DisplacementSample | MonitorSample) -> bool:

@@ -1,18 +1,17 @@
 """The side of another terminal: find the run that is going on, and speak to it.
 
-Imports nothing but the standard library and the errors, so that ``dea-rig stop`` acts at once.
+Imports little beside the standard library, so that ``dea-rig stop`` acts at once.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import socket
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from drivers.links.port_lock import user_directory
 from rig.base.errors import ConfigError
 
 LONGEST = 1024  # bytes of a request
@@ -22,24 +21,17 @@ REPLY_S = 3.0  # the loop looks twenty times a second, unless it hangs
 def run_directory() -> Path:
     """The directory in which this user's live runs are announced; made when it does not exist.
 
+    It belongs to this user alone. One of its name that somebody else has made, or that others may use, is not used.
+
     Raises
     ------
     ConfigError
-        When it belongs to somebody else or others may write to it.
+        When it cannot be made.
     """
-    import tempfile
-
-    base = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("LOCALAPPDATA")
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    folder = Path(base) / "dea-rig" if base else Path(tempfile.gettempdir()) / f"dea-rig-{user}"
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
+        return user_directory()
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made, so nobody could stop the run from there: {error}.") from None
-    if not stat.S_ISDIR(found.st_mode) or (os.name == "posix" and (found.st_uid != user or found.st_mode & 0o077)):
-        raise ConfigError(f"{folder}: is not a directory that only you may use. Remove it and start again.")
-    return folder
+        raise ConfigError(f"Nobody could stop the run from another terminal: {error}.") from None
 
 
 @dataclass(frozen=True)
@@ -111,7 +103,7 @@ def live_run(log: Path | None = None) -> LiveRun:
 
 def live_runs() -> list[LiveRun]:
     """All runs of this user that are going on. Raises `ConfigError` as `run_directory`."""
-    return [run for file in sorted(run_directory().glob("*.json")) if (run := _announced(file)) and run.live]
+    return [run for file in sorted(run_directory().glob("[0-9]*.json")) if (run := _announced(file)) and run.live]
 
 
 def _announced(file: Path) -> LiveRun | None:

@@ -15,10 +15,12 @@ import secrets
 import socket
 from pathlib import Path
 
+from drivers.links.port_lock import remove_if_empty
 from rig.operator.control import Control
 from rig.operator.live import LONGEST, run_directory
 
 MOST = 8  # connections at a time
+TRIES = 20
 
 
 # Who may speak, and what the log calls him.
@@ -35,11 +37,17 @@ class Remote:
         self._socket = socket.create_server(("127.0.0.1", 0))
         self._socket.setblocking(False)
         self._callers: dict[socket.socket, bytes] = {}
-        self._file = run_directory() / f"{os.getpid()}.json"
         about = {"pid": os.getpid(), "port": self._socket.getsockname()[1], "token": self._token, "log": str(log)}
-        self._file.unlink(missing_ok=True)  # of a dead process with our number
-        with os.fdopen(os.open(self._file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            json.dump(about, file)
+        for left in reversed(range(TRIES)):
+            self._file = run_directory() / f"{os.getpid()}.json"
+            try:
+                self._file.unlink(missing_ok=True)  # of a dead process with our number
+                with os.fdopen(os.open(self._file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                    json.dump(about, file)
+                return
+            except FileNotFoundError:  # another program has just removed the directory, which was empty
+                if not left:
+                    raise
 
     def read(self, control: Control) -> list[str]:
         """Serve who has called. Replies are given at once, so there is nothing left to be said here."""
@@ -88,3 +96,4 @@ class Remote:
         self._socket.close()
         with contextlib.suppress(OSError):
             self._file.unlink(missing_ok=True)
+            remove_if_empty(self._file.parent)

@@ -26,6 +26,7 @@ class Prediction:
     peak_field: float
     minimum_hoop_stress: float
     stored_energy: float
+    peak_stretch: float
     status: Status
 
 
@@ -39,6 +40,7 @@ def predict(action: Action, specimen: Specimen, parallel_capacitance: float = 0.
         peak_field=float(np.max(states.peak_field)),
         minimum_hoop_stress=float(np.min(states.min_hoop_stress)),
         stored_energy=_stored_energy(specimen, float(h.max()), max(action.voltage), parallel_capacitance),
+        peak_stretch=float(np.max(states.max_stretch)),
         status=Status(int(np.max(states.status))),
     )
 
@@ -85,6 +87,7 @@ def check_plan(actions: Sequence[Action], scene: Scene, force_noise: float = 0.0
         limits.field.check(prediction.peak_field, f"{where}, predicted")
         limits.hoop_stress.check(prediction.minimum_hoop_stress, f"{where}, predicted")
         limits.energy.check(prediction.stored_energy, f"{where}, predicted")
+        limits.stretch.check(prediction.peak_stretch, f"{where}, predicted")
         if prediction.status is Status.WRINKLED:
             raise LimitError(no_taut_state)
         predictions.append(prediction)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from model.membrane.solve import Solution, Status, solve
+import numpy as np
+from numpy.typing import NDArray
+
+from model.membrane.solve import Solution, Status, solve, solve_many
 from model.specimen import Specimen
 from rig.base.errors import LimitError
 from rig.scene.scene import Scene
@@ -19,6 +22,9 @@ FLAT_M = 1e-6
 # it. Where a zero is stored the limit holds against it at all times, so that no zero step can carry the limit away;
 # where none is, it holds against the bare reading with this allowance.
 ZERO_PART = 0.25
+STRETCH_POINTS = 33  # displacements at which the model is asked for the stretch beforehand
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,7 @@ class Limits:
     field: Limit
     hoop_stress: Limit
     energy: Limit
+    stretch: Limit
     leakage: float  # A beside the charging current
     parallel_capacitance: float  # F beside the film
 
@@ -103,6 +110,7 @@ class Limits:
             field=Limit("field", 0.0, min(candidates, default=math.inf), "V/um", 1e-6),
             hoop_stress=Limit("hoop stress", table.minimum_hoop_stress_kPa * 1e3, math.inf, "kPa", 1e-3),
             energy=Limit("stored energy", 0.0, table.stored_energy_mJ * 1e-3, "mJ", 1e3),
+            stretch=Limit("stretch", 0.0, scene.specimen.specimen().material.max_stretch or math.inf, "(max_stretch)"),
             leakage=table.leakage_uA * 1e-6,
             parallel_capacitance=scene.hv.parallel_capacitance_nF * 1e-9 if scene.hv is not None else 0.0,
         )
@@ -131,7 +139,7 @@ class FilmLimits:
         self._limits = limits
 
     def check(self, h: float, voltage: float, where: str) -> None:
-        """Raise unless the film at ``h`` metres and ``voltage`` volts is taut, below its field and its energy limit.
+        """Raise unless the film at ``h`` metres and ``voltage`` volts is taut and within its limits.
 
         Raises
         ------
@@ -144,6 +152,7 @@ class FilmLimits:
         if state.status is not Status.TAUT:
             raise LimitError(f"{where}: the model has no taut state there ({state.status.message}).")
         self._limits.energy.check(self._energy(state), where)
+        self._limits.stretch.check(state.max_stretch, where)
 
     def _energy(self, state: Solution) -> float:
         """0.5 C V^2 of film and cable (J).
@@ -175,3 +184,30 @@ class FilmLimits:
         for k in range(points):
             h = h0 + (h1 - h0) * k / (points - 1)
             self.check(h, voltage, f"Move to {h1 * 1e3:.2f} mm with {voltage:g} V on, at {h * 1e3:.2f} mm")
+
+
+class StretchLimit:
+    """The film's largest stretch (``max_stretch`` of its material) without voltage, by the model, at any displacement.
+
+    For a disk that is measured many times a second: the model is asked beforehand.
+    """
+
+    def __init__(self, specimen: Specimen, limits: Limits) -> None:
+        self._limit = limits.stretch
+        self._h: Floats = np.empty(0)
+        self._stretch: Floats = np.empty(0)
+        if math.isfinite(self._limit.high):
+            h = np.linspace(FLAT_M, max(limits.displacement.high, 2 * FLAT_M), STRETCH_POINTS)
+            stretch = solve_many(specimen, h, 0.0).max_stretch
+            known = np.isfinite(stretch)
+            self._h, self._stretch = h[known], stretch[known]
+
+    def check(self, h: float, where: str) -> None:
+        """Raise unless the film is stretched less with the disk at ``h`` metres; what is not known is not held.
+
+        Raises
+        ------
+        LimitError
+        """
+        if self._h.size > 1 and math.isfinite(h):
+            self._limit.check(float(np.interp(h, self._h, self._stretch)), where)

@@ -39,7 +39,8 @@ class MaterialTable(Table):
     max_stretch: float | None = Field(
         default=None,
         gt=1.0,
-        description="Largest stretch the film stands, pre-stretch included. Absent: unknown.",
+        description="Largest stretch the film stands, pre-stretch included: what is planned, commanded and measured is "
+        "held below it, by the model. Absent: unknown.",
         json_schema_extra={"usual": [1, 20]},
     )
     source: str = Field(default="", description="Where the numbers come from, for reports.")

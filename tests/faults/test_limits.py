@@ -298,3 +298,23 @@ def test_a_wide_factor_switches_the_comparison_off(tell: Tell) -> None:
 
     story = tell(freeze, replace=("[limits]", "[limits]\nforce_model_factor = 1000.0"))
     assert story.error is None, story.error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "old", "new"),
+    [
+        ("cone-4mm", "max_stretch = 2.4", "max_stretch = 1.3"),
+        (
+            "no-hv",
+            'material = "parker-cao2018"',
+            "material = { mu_Pa = [5e3, 35e3], alpha = [2.5, 5.6], max_stretch = 1.3 }",
+        ),
+    ],
+)
+def test_a_film_is_not_stretched_beyond_what_it_stands(tell: Tell, scene: str, old: str, new: str) -> None:
+    """With high voltage the guard refuses the move; without, the watch ends the run at the displacement measured."""
+    ramp = HEAD + '[[step]]\ndo = "ramp"\ndisplacement_mm = 8.0\nspeed_mm_per_s = 2.0\n'
+    story = tell(protocol=ramp, checked=False, scene=scene, replace=(old, new), nearer=scene != "no-hv")
+    assert isinstance(story.error, LimitError) and "max_stretch" in str(story.error), story.error
+    assert story.bench.world.indentation_at(story.end) < 4.2e-3  # 1.3 is reached at 3.8 mm

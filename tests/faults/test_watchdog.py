@@ -37,6 +37,8 @@ CHANGES = {
     "ramp_V_per_s = 300.0": "ramp_V_per_s = 1000.0\ntimeout_s = 2.0",
     "rate_Hz = 100.0": "rate_Hz = 100.0\ntimeout_s = 2.0",
     "mm_per_V = 4.0": "timeout_s = 1.0\nmm_per_V = 4.0",
+    "[simulation]\nseed": '[monitor]\ndriver = "labjack-monitor"\nquantity = "voltage"\nfactor = 1000.0\n'
+    "timeout_s = 2.0\n\n[simulation]\nseed",
     "../calibrations": str(FIXTURES / "calibrations"),
 }
 pytestmark = [
@@ -91,7 +93,7 @@ class Running:
             time.sleep(0.02)
 
     def confirm(self) -> None:
-        """Type the highest voltage, as from another terminal: ports on the network are real ones."""
+        """Type the highest voltage, as from another terminal."""
         with suppress(RigError, OSError):
             run = live_run(self.folder / "a.mcap")
             if expected := run.send("status").get("expected"):
@@ -140,7 +142,7 @@ def test_the_whole_job_with_amplifier_force_and_monitor_on_one_device(tmp_path: 
     """Two connections: one of the sensors, one of the guard. Whoever comes third is turned away."""
     run = Running(tmp_path, "[0, 800]")
     try:
-        places = {role: run.bench.ports[role] for role in ("force", "displacement", "hv")}
+        places = {role: run.bench.ports[role] for role in ("force", "displacement", "hv", "monitor")}
         assert len({tuple(place.items()) for place in places.values()}) == 1
         run.until_live()
         third = (str(places["hv"]["host"]), int(places["hv"]["tcp_port"]))
@@ -154,6 +156,7 @@ def test_the_whole_job_with_amplifier_force_and_monitor_on_one_device(tmp_path: 
         run.out.seek(0)
         told = run.out.read()
         assert run.process.returncode == 0 and "high voltage off" in told, told
+        assert "(monitor) shows" in told and "A second reading of the voltage (monitor: labjack-monitor)" in told
         assert run.dac() == 0.0
     finally:
         run.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from rig.operator.live import LONGEST, LiveRun, live_run, run_directory
 from rig.operator.remote import MOST, Remote
 from rig.operator.signals import stop_on_signals
 
+USER = os.getuid() if hasattr(os, "getuid") else 0
 posix = pytest.mark.skipif(os.name != "posix", reason="terminals and their signals are POSIX")
 
 
@@ -157,10 +159,47 @@ def test_the_announcement_is_the_users_alone_and_goes_with_the_run(folder: Path,
     (announced,) = folder.iterdir()
     assert announced.stat().st_mode & 0o077 == 0 and folder.stat().st_mode & 0o077 == 0
     remote.close()
-    assert not list(folder.iterdir())
-    folder.chmod(0o777)
-    with pytest.raises(ConfigError, match="only you may use"):
-        run_directory()
+    assert not folder.exists()
+
+
+@posix
+@pytest.mark.parametrize("kind", ["open", "link", "file", "another's"])
+def test_a_directory_that_is_not_the_users_alone_is_neither_used_nor_in_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """Nobody can make it first: it is found by its owner, and its name cannot be guessed."""
+    temporary, runtime = tmp_path / "tmp", tmp_path / "run"
+    for one in (temporary, runtime):
+        one.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    if Path(f"/run/user/{USER}").is_dir():
+        pytest.skip("this system has a directory of its own for it")
+    guessed = [runtime / "dea-rig", temporary / f"dea-rig-{USER}", temporary / f"dea-rig-{USER}-first"]
+    for place in guessed:
+        if kind == "file":
+            place.write_text("")
+        elif kind == "link":
+            place.symlink_to(tmp_path)
+        else:
+            place.mkdir(mode=0o700)
+            if kind == "open":
+                place.chmod(0o777)
+    if kind == "another's":  # made as 0700, by somebody with another number
+        seen = Path.lstat
+
+        def lstat(path: Path) -> os.stat_result:
+            found = seen(path)
+            return os.stat_result((*found[:4], USER + 1, *found[5:])) if path in guessed else found
+
+        monkeypatch.setattr(Path, "lstat", lstat)
+    folder = run_directory()
+    assert folder not in guessed and folder.parent == temporary and folder == run_directory()
+    assert folder.stat().st_mode & 0o077 == 0 and re.fullmatch(rf"dea-rig-{USER}-\w{{8}}", folder.name)
+    with closing(Control([Remote(tmp_path / "run.mcap")])):
+        assert [file.name for file in folder.iterdir()] == [f"{os.getpid()}.json"]
+    assert not folder.exists() and not (set(temporary.iterdir()) - set(guessed))
 
 
 def test_what_a_killed_run_left_is_not_taken_for_a_run(folder: Path) -> None:
