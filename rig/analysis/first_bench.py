@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import date
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from rig.scene.presets import Preset
 from rig.scene.scene import LimitsTable, Scene, SessionTable
 from rig.scene.specimen import MaterialTable, SpecimenTable
 from rig.sim.settings import SimulationSettings
+from rig.sim.truth import MonitorTruth
 from rig.sim.twins import of_role
 
 CELLS_N = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rated forces of load cells
@@ -138,7 +140,8 @@ def simulated_instruments(*, hv: bool, displacement: bool, monitor: str = "") ->
     roles = [role for role in DRIVERS if (role != "displacement" or displacement) and (role != "hv" or hv)]
     made: Instruments = {role: {"driver": DRIVERS[role]} for role in roles}
     if monitor:
-        factor = of_role("monitor")[monitor].truth().units_per_number  # type: ignore[call-arg]
+        truth = of_role("monitor")[monitor].truth()  # type: ignore[call-arg] # each has a default driver
+        factor = cast(MonitorTruth, truth).units_per_number
         made["monitor"] = {"driver": monitor, "quantity": "voltage", "factor": factor}
     return made
 

@@ -14,6 +14,7 @@ from drivers.roles import DisplacementSample, ForceSample, HVFlag, HVSample, Mon
 from rig.base.errors import FaultError, StaleData
 from rig.bench.bench import Bench
 from rig.engine.follows import ForceFollows
+from rig.engine.laser_scale import LaserScale
 from rig.log.recorder import Recorder
 from rig.safety.guard import SAFE_VOLTAGE, AnyGuard, GuardState, flag_names
 from rig.safety.limits import ZERO_PART, Limits, StretchLimit
@@ -55,6 +56,7 @@ class Watch:
         self._agreed = -math.inf
         self._seen_off = False
         self._follows = ForceFollows(bench.scene, limits)
+        self._scale = LaserScale()
         self._stretch = StretchLimit(bench.scene.specimen.specimen(), limits)
 
     def sample(self, role: str, sample: Sample, now: float) -> None:
@@ -93,6 +95,7 @@ class Watch:
                 kind = FaultError if role == "hv" else StaleData  # an output that is not seen is not ramped, but cut
                 raise kind(f"{role}: no sample for {age:.2f} s.")
         if not math.isfinite(recorder.contact):
+            self._prove_scale()
             return
         if not recorder.has_laser:
             self._limits.displacement.check(recorder.displacement, "Displacement measured")
@@ -162,6 +165,11 @@ class Watch:
                 "Find out who did; take it down by hand; start again."
             )
 
+    def _prove_scale(self) -> None:
+        stage, laser = self._recorder.stage, self._recorder.displacement_sample
+        if self._recorder.has_laser and stage is not None and laser is not None and stage.moving and not laser.flags:
+            self._scale.sample(stage.position, self._recorder.without_zero(laser))
+
     def _compare_stage_and_laser(self, now: float) -> None:
         """Beyond contact the disk goes with the stage; if they part, one of the two sensors does not tell the truth."""
         recorder = self._recorder
@@ -174,7 +182,7 @@ class Watch:
         elif now - self._agreed > DISAGREEMENT_S:
             raise FaultError(
                 f"stage and laser disagree: {by_stage * 1e3:.2f} against {recorder.displacement * 1e3:.2f} mm. "
-                "One of them is frozen, or the pusher has slipped."
+                "One of them is frozen, the pusher has slipped, or the unit or scale of one is wrong."
             )
 
 

@@ -83,6 +83,10 @@ class Recorder:
             return self._gains.force * (sample.reading - self.force_zero)
         return self._gains.displacement * (sample.displacement - self.displacement_zero)
 
+    def without_zero(self, sample: DisplacementSample) -> float:
+        """Metres of one sample by the certificate, whatever zero the run has taken."""
+        return self._gains.displacement * sample.displacement
+
     def from_stored_zero(self, reading: float) -> float:
         """Newtons of one reading against the stored zero, whatever zero the run has taken; 0 where none is stored."""
         return self._gains.force * (reading - (self._gains.stored_zero or 0.0))

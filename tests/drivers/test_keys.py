@@ -24,7 +24,8 @@ zaber        poll_rate_Hz            50.0      5      200
 zaber        approach_from_mm        0.0       0      -
 zaber        device                  1         1      99
 zaber        axis                    1         1      9
-zaber        full_step_um            31.75     (0     -
+zaber        full_step_um            None      (0     -
+zaber        peripheral_id           None      0      -
 gsv8         timeout_s               0.25      (0     10
 gsv8         boot_s                  10.0      0      60
 gsv8         baud                    230400    (0     -

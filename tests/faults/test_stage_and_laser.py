@@ -341,3 +341,15 @@ def test_two_stages_with_one_address_are_refused_before_anything_moves(serial: i
     assert ("'50443' and '50444'" in str(caught.value)) is (serial == 50_444)
     assert found.twin_settings() == found.at_first and other.twin_settings() == other.at_first
     assert found.bench.world.stage.at(found.clock.now())[0] == 0.0
+
+
+@pytest.mark.slow
+def test_a_laser_in_another_unit_ends_the_run_before_the_film_is_met(tell: Any) -> None:
+    """One that sees the pusher, and shows 1.9 mm for each."""
+
+    def sees_the_pusher(now: float, bench: SimulatedBench, control: Any) -> None:
+        bench.world.fixture = "target"
+
+    story = tell(meanwhile=sees_the_pusher, replace=("gain_error = -3e-4", "gain_error = 0.9"))
+    assert "1.9 times as much" in str(story.error) and "The film was not met yet" in str(story.error), story.error
+    assert story.bench.world.indentation_at(story.end) == 0.0

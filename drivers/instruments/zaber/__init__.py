@@ -31,10 +31,16 @@ class ZaberSettings(StageSettings, SerialSettings):
     driver: Literal["zaber"] = Field(description="Zaber stage, ASCII protocol on a serial port.")
     device: int = Field(default=1, ge=1, le=99, description="Address of the device on the line.")
     axis: int = Field(default=1, ge=1, le=9, description="Axis of the device; 1 for stages with a built-in controller.")
-    full_step_um: Positive = Field(
-        default=31.75,
-        description="Travel per full motor step (um): screw pitch over steps a turn. 31.75 is a 6.35 mm screw over 200 "
-        "steps (X-LSQ..B); the device does not state it.",
+    full_step_um: Positive | None = Field(
+        default=None,
+        description="Travel per full motor step (um): screw pitch over steps a turn; no device states it. 31.75 is a "
+        "6.35 mm screw over 200 steps (LSQ..B). Absent: that of the X-LSQ150B; any other stage is refused.",
+    )
+    peripheral_id: int | None = Field(
+        default=None,
+        ge=0,
+        description="Id of the stage that must be plugged into this axis of a controller. Absent: any. `serial` is "
+        "that stage's own where it states one.",
     )
 
 

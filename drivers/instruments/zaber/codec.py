@@ -60,6 +60,15 @@ WARNINGS = {
 }
 """Warning flags; F is a fault (motion stopped or refused), W a warning, N a note."""
 
+POWER_CYCLE = "Remove the cause; if the flag stays, power-cycle the stage."
+FAULT_ADVICE = {
+    "FZ": "Another stage is plugged into this axis than was activated last. If two are swapped, put them back. If this "
+    "one is meant, activate it in the maker's software (`activate`), which may set speed, limits and resolution anew; "
+    "give its full_step_um in the scene, and start again.",
+    "FN": "The controller's firmware does not know the stage that is plugged in: update the firmware.",
+}
+"""What to do about a fault that power-cycling does not end."""
+
 UNREFERENCED = frozenset({"WR", "WH"})
 
 REJECTIONS = {
@@ -71,7 +80,10 @@ REJECTIONS = {
     "DEVICEONLY": ("the command is for the device, not an axis", "This is a fault of the driver: report it."),
     "AXISONLY": ("the command is for an axis, not the device", "This is a fault of the driver: report it."),
     "NOACCESS": ("the command needs a higher access level", "Set system.access in the maker's software."),
-    "INACTIVE": ("the axis is inactive", "Plug in the peripheral and activate it in the maker's software."),
+    "INACTIVE": (
+        "the axis is inactive",
+        "Plug in what was activated, or activate this one in the maker's software.",
+    ),
     "NOTSUPPORTED": ("the command is not supported on this stage", "Check the stage's model."),
     "DRIVERDISABLED": ("the motor driver is disabled", "Look for a fault flag, remove its cause, and power-cycle it."),
     "LONGWORD": ("a word of the command is too long", "This is a fault of the driver: report it."),

@@ -11,7 +11,9 @@ from typing import NamedTuple, TypeVar
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
 from drivers.heard import Heard
 from drivers.instruments.zaber.codec import (
+    FAULT_ADVICE,
     FLAGS,
+    POWER_CYCLE,
     REJECTIONS,
     UNREFERENCED,
     VELOCITY_UNIT,
@@ -25,6 +27,7 @@ from drivers.instruments.zaber.codec import (
     encode,
 )
 from drivers.instruments.zaber.second import SecondDevice
+from drivers.instruments.zaber.travel import FULL_STEP_UM, Peripheral, full_step_um, not_known, swapped
 from drivers.links.link import ByteLink, DeviceError, DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import Identity, StageSample
 
@@ -74,8 +77,10 @@ class ZaberStage:
         How often the position is asked for.
     timeout_s : float
         How long to wait for each reply.
-    full_step_um : float
-        Travel per full motor step: 31.75 um is a 6.35 mm screw on a motor of 200 steps, as in the X-LSQ150B.
+    full_step_um : float, optional
+        Travel per full motor step; without it, that of a stage that is known by its id, or the stage is refused.
+    peripheral_id : int, optional
+        What must be plugged into this axis of a controller.
     boot_s : float
         How long the first answer may take.
     """
@@ -89,7 +94,8 @@ class ZaberStage:
         axis: int = 1,
         poll_rate_Hz: float = 50.0,
         timeout_s: float = 0.25,
-        full_step_um: float = 31.75,
+        full_step_um: float | None = None,
+        peripheral_id: int | None = None,
         boot_s: float = 0.0,
     ) -> None:
         self.name = name
@@ -100,7 +106,7 @@ class ZaberStage:
         self._link = link
         self._device, self._axis = device, axis
         self._schedule = Schedule(1.0 / poll_rate_Hz, self.counters)
-        self._full_step = full_step_um * 1e-6
+        self._given_step, self._wanted_peripheral = full_step_um, peripheral_id
         self._codec = Codec(self.counters)
         self._boot_s = boot_s
         self._heard = Heard()
@@ -297,7 +303,12 @@ class ZaberStage:
         device_id = yield from self._number("get deviceid", axis=0)
         serial = yield from self._number("get system.serial", axis=0)
         version = (yield from self._ask("get version", axis=0)).message.data
-        self.identity = Identity(model=f"Zaber device {device_id}", serial=str(serial), firmware=version)
+        peripheral = yield from self._peripheral(device_id)
+        self.identity = Identity(
+            model=f"Zaber device {device_id}" + (f" peripheral {peripheral.id}" if peripheral.id else ""),
+            serial=str(peripheral.serial or serial),  # the stage's own, which may be plugged in elsewhere tomorrow
+            firmware=version,
+        )
         self._facts = yield from self._read_facts()
         resolution, low, high, acceleration = (self._facts[key] for key in FACTS)
         max_speed = yield from self._number("get maxspeed")
@@ -308,7 +319,10 @@ class ZaberStage:
                 f"maxspeed {max_speed}, accel {acceleration}",
                 "Restore its settings in the maker's software.",
             )
-        self._step = self._full_step / resolution
+        step_um = full_step_um(self._given_step, device_id, peripheral)
+        if step_um is None:
+            raise DeviceRefused(self._label, *not_known(device_id, peripheral, (high - low) / resolution))
+        self._step = step_um * 1e-6 / resolution
         self._travel_steps = (low, high)
         self._acceleration = acceleration * 1e4 / VELOCITY_UNIT * self._step
         self.found = {"maxspeed": max_speed}
@@ -340,6 +354,21 @@ class ZaberStage:
         self._second.judge_all()
         self._schedule.start(self._now)
         self._ready = True
+
+    def _peripheral(self, device_id: int) -> _Part[Peripheral]:
+        """What is plugged into the axis; a stage with a controller of its own is not asked. Firmware 6 says its id."""
+        if device_id in FULL_STEP_UM and self._wanted_peripheral is None:
+            return Peripheral(0, 0)
+        found = {}
+        for key in ("peripheral.id", "peripheralid", "peripheral.serial"):
+            reply = (yield from self._ask(f"get {key}", may_fail=True)).message
+            found[key] = int(reply.data) if reply.accepted and WHOLE.fullmatch(reply.data) else 0
+        one = Peripheral(found["peripheral.id"] or found["peripheralid"], found["peripheral.serial"])
+        if one.id:
+            self.settings |= {"peripheral_id": str(one.id), "peripheral_serial": str(one.serial)}
+        if self._wanted_peripheral not in (None, one.id):
+            raise DeviceRefused(self._label, *swapped(self._axis, one, self._wanted_peripheral))
+        return one
 
     def _read_facts(self) -> _Part[dict[str, int]]:
         facts = {}
@@ -542,11 +571,8 @@ class ZaberStage:
         faults = [flag for flag in self._flags if flag.startswith("F") and flag not in self._faults_told]
         if faults:
             self._faults_told.update(faults)
-            raise DeviceRefused(
-                self._label,
-                f"the stage reports {_in_words(faults)}",
-                "Remove the cause; if the flag stays, power-cycle the stage.",
-            )
+            advice = [FAULT_ADVICE[flag] for flag in faults if flag in FAULT_ADVICE] or [POWER_CYCLE]
+            raise DeviceRefused(self._label, f"the stage reports {_in_words(faults)}", " ".join(advice))
 
     def _require_ready(self) -> None:
         if not self._ready:

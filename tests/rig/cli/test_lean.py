@@ -104,6 +104,8 @@ CONTROL |= {"rig.base", "rig.base.errors", "rig.base.clock"}
 # An error is told by `rig.base.terminal` (a terminal that takes nothing must not hold "stop" up), and what it quotes
 # by `rig.base.text` (nothing in it drives the terminal). Both need only click and the standard library.
 CONTROL |= {"rig.base.text", "rig.base.terminal"}
+# The user's own directory is found by the rules of the locks on ports; they need the standard library only.
+CONTROL |= {"drivers", "drivers.links", "drivers.links.link", "drivers.links.port_lock", "drivers.links.system"}
 
 
 @pytest.mark.parametrize("word", ["stop", "pause", "continue"])
