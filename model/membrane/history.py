@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import Array
 from model.material.materials import Branch
 from model.membrane import refinement, ritz
-from model.membrane.march import Course, Step, Trail, goal, march, unpack
+from model.membrane.march import Course, Step, Trail, flat_guess, goal, march, unpack
 from model.membrane.output import fine_table
 from model.membrane.refinement import ROUND_OFF_TENSION
 from model.membrane.solve import Status, solve_many
@@ -153,6 +153,35 @@ def _columns(specimen: Specimen) -> int:
     """`Films.columns` of a film."""
     material = specimen.material
     return len(material.mu) + len(material.alpha) + 2 * len(material.branches) + 3
+
+
+AT_ONCE_PARTS = (1, 8)  # of the way from the flat film to a state, all at once or in so many
+
+
+def at_once(specimen: Specimen, h: ArrayLike, voltage: ArrayLike = 0.0, *, tolerance: float = 1e-6) -> Array:
+    """Force (N) of a rested film that is pushed in no time, at arrays of displacement (m) and voltage (V).
+
+    Its branches have not begun to relax, and answer like films without pre-stretch: the largest force that the film can
+    have there after any way from rest that only pushes. NaN where it has no state.
+    """
+    h, voltage = np.broadcast_arrays(np.asarray(h, dtype=float), np.asarray(voltage, dtype=float))
+    [(modes, _)] = _alike([_bare(specimen)], tolerance)
+    force = np.full(h.size, np.nan)
+    with np.errstate(all="ignore"):
+        for parts in AT_ONCE_PARTS:
+            left = np.flatnonzero(np.isnan(force))
+            if not len(left):
+                break
+            films = Films.of([_bare(specimen)], modes).take(np.zeros(len(left), dtype=np.intp))
+            rest = films.log_prestretch * np.ones((2, films.branches, *films.grid.radius.shape))
+            height, volts, state = h.ravel()[left] / parts, voltage.ravel()[left] / parts, None
+            for part in range(1, parts + 1):
+                instant = Instant(part * height, part * volts)
+                state = flat_guess(films, instant) if state is None else state
+                at = balance(films, instant, rest, np.zeros_like(films.time), state, goal(tolerance, False))
+                state = at.state
+            force[left] = np.where(at.ok, instant.side * films.unit * at.lam, np.nan)
+    return np.where(h == 0.0, 0.0 * force.reshape(h.shape), force.reshape(h.shape))
 
 
 def _checked(

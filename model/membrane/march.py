@@ -150,6 +150,15 @@ def _extrapolated(times: Sequence[Array], values: Sequence[Array], at: Array, fr
     return found
 
 
+def flat_guess(films: Films, instant: Instant) -> State:
+    """A first state of films that were never pushed before."""
+    height = np.maximum(instant.height(films), 1e-3)
+    problem = Problem(Film(films.law, None, Evaluations()), films.log_prestretch, films.span, height)
+    guess = ritz.guess(problem, films.grid)
+    elastic = np.zeros((2, films.branches, *films.grid.radius.shape))
+    return State(guess.c, guess.w * (instant.height(films) / height), elastic)
+
+
 class March:
     """Films on their way, each through its own course."""
 
@@ -188,10 +197,7 @@ class March:
         self.ok = np.ones(len(self.now), dtype=np.bool_)
         shape = (2, films.branches, *films.grid.radius.shape)
         viscous = np.broadcast_to(films.log_prestretch, shape).copy()
-        height = np.maximum(instant.height(films), 1e-3)
-        problem = Problem(Film(films.law, None, Evaluations()), films.log_prestretch, films.span, height)
-        guess = ritz.guess(problem, films.grid)
-        state = State(guess.c, guess.w * (instant.height(films) / height), np.zeros(shape))
+        state = flat_guess(films, instant)
         rested = np.zeros_like(viscous)
         moment = Moment(viscous, rested, pack(films, instant.height(films), state))
         if self.sensitivities:

@@ -2,8 +2,9 @@ r"""Whether the force follows the film: a plausibility watch, with a band so wid
 
 While the film moves at one voltage, the measured force :math:`F` goes with the model's :math:`M` at the measured
 displacement as :math:`F = a + b M`. Its slope :math:`b`, by least squares over the samples since it was last judged,
-must lie within :math:`1/k` and :math:`k`, with :math:`k` of ``limits.force_model_factor``. It is judged as soon as the
-noise :math:`\sigma` cannot feign a film: when its standard error :math:`\sigma / \sqrt{\sum (M - \bar M)^2}` is
+must lie within :math:`1/k` and :math:`k`, with :math:`k` of ``limits.force_model_factor``; of a film that takes time
+the upper bound is as much higher as it is stiffer when pushed in no time. It is judged as soon as the noise
+:math:`\sigma` cannot feign a film: when its standard error :math:`\sigma / \sqrt{\sum (M - \bar M)^2}` is
 below :math:`1 / 4k`. A load cell that is frozen but for its noise has the slope 0; a blocked cell, a film that has torn
 and a disk that is not where the approach believes it to be are found as well.
 """
@@ -37,8 +38,18 @@ class ForceFollows:
         force = solve_many(self._specimen, h, 0.0).force
         known = np.isfinite(force)
         self._h, self._model = h[known], force[known]
+        self._stiffer = self._at_once()
         self._volts = 0.0
         self.restart()
+
+    def _at_once(self) -> float:
+        """How much stiffer the film is where it is pushed in no time, at most: 1 of an elastic one."""
+        if not self._specimen.material.branches or self._h.size < 2:
+            return 1.0
+        from model.membrane.history import at_once
+
+        slopes = np.diff(at_once(self._specimen, self._h, 0.0, tolerance=1e-4)) / np.diff(self._model)
+        return max(1.0, float(np.nanmax(slopes, initial=1.0)))
 
     def learn(self, noise: float) -> None:
         """Take the standard deviation (N) of one sample of the unloaded sensor."""
@@ -97,4 +108,4 @@ class ForceFollows:
         )
 
     def _holds(self, slope: float) -> bool:
-        return 1 / self._factor <= slope <= self._factor
+        return 1 / self._factor <= slope <= self._factor * self._stiffer

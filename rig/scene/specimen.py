@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from drivers.settings import NotNegative, Positive
-from model.material.materials import NAMED, Material
+from model.material.materials import NAMED, Branch, Material
 from model.specimen import Specimen
 from rig.base.law_tables import any_law, law_values
 from rig.base.table import Table
@@ -20,6 +21,18 @@ USUAL_MODULUS_PA = (500.0, 2e7)  # of elastomers, from gels to hard rubber
 
 def _usual(modulus: float) -> bool:
     return USUAL_MODULUS_PA[0] <= modulus <= USUAL_MODULUS_PA[1]
+
+
+class BranchTable(Table):
+    """One Maxwell branch of a film that takes time, beside the relaxed film."""
+
+    ratio: NotNegative = Field(
+        description="Its stiffness over that of the relaxed film. Typical: 0.02 to 2.",
+        json_schema_extra={"usual": [0.001, 20]},
+    )
+    time_s: Positive = Field(
+        description="Its relaxation time (s). Typical: 0.1 to 300.", json_schema_extra={"usual": [1e-4, 1e6]}
+    )
 
 
 class MaterialTable(Table):
@@ -42,6 +55,12 @@ class MaterialTable(Table):
         description="Largest stretch the film stands, pre-stretch included: what is planned, commanded and measured is "
         "held below it, by the model. Absent: unknown.",
         json_schema_extra={"usual": [1, 20]},
+    )
+    branches: list[BranchTable] = Field(
+        default_factory=list,
+        max_length=8,
+        description="What relaxes beside the relaxed film that the law describes. With them `check` expects the force "
+        "of a film pushed in no time where that is larger. Default: none, the film is elastic.",
     )
     source: str = Field(default="", description="Where the numbers come from, for reports.")
 
@@ -81,9 +100,11 @@ class MaterialTable(Table):
         """The same in SI units."""
         law, values = law_values(self)
         field = None if self.breakdown_V_per_um is None else self.breakdown_V_per_um * 1e6
-        return Material.with_law(
+        film = Material.with_law(
             name, law, values, self.eps_r, breakdown_field=field, max_stretch=self.max_stretch, source=self.source
         )
+        branches = tuple(Branch(one.ratio, one.time_s) for one in self.branches)
+        return replace(film, branches=branches) if branches else film
 
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from model.arrays import Array
 from model.material.gent import Gent
 from model.material.materials import NAMED, Branch, Material
 from model.material.yeoh import Yeoh
-from model.membrane.history import History, solve_histories, solve_history
+from model.membrane.history import History, at_once, solve_histories, solve_history
 from model.membrane.march import Course, March
 from model.membrane.solve import Status, solve, solve_many
 from model.membrane.viscous import Films, Instant, State, balance
@@ -105,6 +105,9 @@ def test_response_at_once_is_that_of_branches_without_prestretch(lp: float, volt
     """A film pushed in no time: branches answer like films that were not pre-stretched."""
     found = solve_history(film([(0.2, 1.0), (0.1, 10.0)], lp=lp), [0, 1], [10e-3, 10e-3], [voltage] * 2, [0.0])
     assert found.force[0] == pytest.approx(wanted, rel=1e-8)
+    many = at_once(film([(0.2, 1.0), (0.1, 10.0)], lp=lp), [[0.0, 10e-3], [-10e-3, 5e-3]], [voltage], tolerance=1e-8)
+    np.testing.assert_allclose(many[0, 1], wanted, rtol=1e-8)
+    assert many[0, 0] == 0.0 and many[1, 0] == -many[0, 1] and 0.0 < many[1, 1] < wanted
 
 
 def test_exact_scalings() -> None:

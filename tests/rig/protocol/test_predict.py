@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from model.membrane.history import at_once, solve_history
 from model.membrane.solve import solve, solve_many
 from rig.base.errors import LimitError
 from rig.base.toml_file import validate
@@ -92,3 +93,20 @@ def test_nan_fails_every_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(predict, "predict", spoilt)
         with pytest.raises(LimitError, match="is outside"):
             check(scene)
+
+
+def test_a_film_that_takes_time_is_expected_as_stiff_as_it_is_at_once(scene: Scene) -> None:
+    """Its largest force is that of branches that were not stretched before: more than (1 + ratio) times at times."""
+    raw = scene.model_dump(exclude_none=True)
+    raw["specimen"]["material"]["branches"] = [{"ratio": 0.2, "time_s": 1.0}, {"ratio": 0.1, "time_s": 10.0}]
+    viscous = validate(raw, Scene, "scene", "test")
+    film = viscous.specimen.specimen()
+    largest = float(at_once(film, 5e-3))
+    relaxed = float(solve(film, 5e-3).force)
+    assert largest > 1.02 * relaxed
+    slow = solve_history(film, [0.0, 1e-4, 1.0], [0.0, 5e-3, 5e-3], 0.0, [1e-4], tolerance=1e-5).force[0]
+    assert largest == pytest.approx(slow, rel=1e-3)
+    check(scene, force_N=relaxed * (1 + 1e-5))
+    check(viscous, force_N=largest * (1 + 1e-5))
+    with pytest.raises(LimitError, match="force"):
+        check(viscous, force_N=largest * (1 - 1e-4))
