@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 @click.option("--out", type=FOLDER, default="designs", show_default=True)
 @click.option("--workers", type=click.IntRange(1, 256), default=1, show_default=True, help="Processes for maps.")
 @click.option("--dask", metavar="ADDRESS", help="Dask scheduler that carries maps, e.g. tcp://10.0.0.5:8786.")
-@click.option("--compare", is_flag=True, help="Time the paper's shooting method on a sample of a map too.")
+@click.option(
+    "--compare",
+    is_flag=True,
+    help="Time the paper's shooting method on a sample of a map too; of a map that is there already, only that.",
+)
 def command(study: Path, out: Path, workers: int, dask: str | None, compare: bool) -> None:
     """Carry out STUDY (TOML): pictures, CSV, and the paper's claims beside the same computed here."""
     from rig.base.clock import RealClock
@@ -34,7 +38,8 @@ def command(study: Path, out: Path, workers: int, dask: str | None, compare: boo
     with _executor(workers, dask) as pool, progress(wanted.title or study.stem) as update:
         outcome = run_study(wanted, study.stem, out, pool, update, compare=compare)
     show(*outcome.show)
-    click.echo(f"{clock.now():.1f} s; written: {', '.join(str(file) for file in outcome.files)}")
+    written = f"; written: {', '.join(str(file) for file in outcome.files)}" if outcome.files else ""
+    click.echo(f"{clock.now():.1f} s{written}")
 
 
 @contextmanager

@@ -116,12 +116,15 @@ def _broyden(miss: Callable[[float, float], Array], h: float, voltage: float) ->
     raise ShootingFailed("no state at breakdown within 20 steps")
 
 
-def sample(points: Sequence[Point], rows: Sequence[Row], count: int = SAMPLE) -> list[tuple[Point, Row]]:
-    """Plain points that end in breakdown, spread over the map."""
+def sample(points: Sequence[Point], limits: Sequence[str], count: int = SAMPLE) -> list[int]:
+    """Which points to shoot: plain ones whose stroke ends in breakdown, spread over the map.
+
+    ``limits`` tells of each point what ends its stroke.
+    """
     plain = [
-        (point, row)
-        for point, row in zip(points, rows, strict=True)
-        if point.treatment is Treatment.PLAIN and row.limit == "BREAKDOWN"
+        i
+        for i, (point, limit) in enumerate(zip(points, limits, strict=True))
+        if point.treatment is Treatment.PLAIN and limit == "BREAKDOWN"
     ]
     if not plain:
         return []
@@ -140,13 +143,13 @@ def compare(
 
 
 def comparison_table(shots: Sequence[Shot], actuators: int, seconds: float) -> Table:
-    """Ours beside the paper's method, and how many times faster the whole study was."""
+    """Ours beside the paper's method, and how many times faster so many actuators were here, in ``seconds``."""
     each = float(np.mean([shot.seconds for shot in shots]))
     whole = each * actuators
     table = Table(
         title="A sample by the paper's method: shooting, BDF, eqs. (1)-(4)",
         caption=(
-            f"Processor time: the study's {actuators} actuators {seconds:.1f} s; by the paper's method one "
+            f"Processor time: {actuators} actuators here {seconds:.1f} s; by the paper's method one "
             f"{each:.1f} s, as many {whole:.0f} s: {whole / seconds:.0f} times as long."
         ),
     )

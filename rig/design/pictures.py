@@ -85,7 +85,7 @@ def strokes_and_work(rows: Sequence[Row], quantity: str, title: str, path: Path)
                     mine = [r for r in rows if (r.case, r.treatment, r.prestretch) == (case, treatment, lp)]
                     x = np.array([row.radius_ratio for row in mine])
                     y = scale * np.array([value(row, quantity) for row in mine])
-                    folded = np.array([row.status == "WRINKLED" for row in mine])
+                    folded = np.array([row.status == "WRINKLED" for row in mine], dtype=bool)  # of none, too
                     axes.plot(x, y, color=colour, linestyle=dash, linewidth=1.4, label=f"λp = {lp:g}")
                     for some, face in ((~folded, colour), (folded, "white")):
                         axes.plot(x[some], y[some], marker, color=colour, markerfacecolor=face, markersize=4)
@@ -118,7 +118,7 @@ def peaks(rows: Sequence[Row], title: str, path: Path) -> None:
                     mine = [row for row in rows if (row.case, row.treatment) == (case, treatment)]
                     x = np.array([row.radius_ratio for row in mine])
                     y = scale * np.array([value(row, quantity) for row in mine])
-                    folded = np.array([row.status == "WRINKLED" for row in mine])
+                    folded = np.array([row.status == "WRINKLED" for row in mine], dtype=bool)  # of none, too
                     axes.plot(x, y, color=colour, linestyle=dash, linewidth=1.5, label=f"{case}: {CASES[case]}")
                     for some, face in ((~folded, colour), (folded, "white")):
                         axes.plot(x[some], y[some], marker, color=colour, markerfacecolor=face, markersize=4.5)

@@ -9,12 +9,14 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
+from model.actuator import design
 from model.actuator.design import Point, Row, Swept, Treatment, sweep
 from model.verification.baselines import explicit_shooting
 from model.verification.baselines.common import Film
@@ -22,9 +24,10 @@ from model.verification.baselines.shooting import Equations
 from model.verification.reference import reference
 from rig.base.errors import ConfigError
 from rig.cli.app import main
+from rig.design import compare as shooting
 from rig.design.best import task_of
 from rig.design.claims import EVERY, FLAT, HYPOTHESIS, Claims, judge
-from rig.design.compare import sample, shoot
+from rig.design.compare import Shot, sample, shoot
 from rig.design.hypothesis import hypothesis_rows
 from rig.design.run import Curve, boundary, map_points, profile_curves, run_study
 from rig.design.study import BoundaryStudy, MapStudy, OptimiseStudy, ProfilesStudy, load_study
@@ -77,13 +80,13 @@ def test_every_point_of_figures_5_and_6_is_on_the_integrated_curve(curves: list[
         path = solve_ivp(
             Equations(film).explicit,
             (at[0], 0.0),
-            [start[0], film.lp, start[1], 0.0],
+            [math.log(start[0]), math.log(film.lp), start[1], 0.0],
             "DOP853",
             t_eval=np.clip(at, at[0], 0.0),
             rtol=1e-13,
             atol=1e-14,
         )
-        l1, l2 = path.y[:2]
+        l1, l2 = np.exp(path.y[:2])
         shear = s.specimen.material.shear_modulus
         radial, hoop = film.stresses(l1, l2)
         field = s.voltage / s.specimen.thickness * l1 * l2
@@ -271,8 +274,8 @@ def test_any_executor_gives_the_same_table() -> None:
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]  # a block a treatment and case
     with ThreadPoolExecutor(2) as pool:
         assert same(alone.rows, sweep(small(), executor=pool).rows)
-    chosen = sample(small(), alone.rows)
-    assert [(point.case, point.treatment) for point, _ in chosen] == [("I", Treatment.PLAIN), ("II", Treatment.PLAIN)]
+    chosen = [small()[i] for i in sample(small(), [row.limit for row in alone.rows])]
+    assert [(point.case, point.treatment) for point in chosen] == [("I", Treatment.PLAIN), ("II", Treatment.PLAIN)]
 
 
 @pytest.mark.slow
@@ -282,6 +285,47 @@ def test_processes_give_the_same_table() -> None:
 
 
 # ---- files and the command
+
+
+@pytest.mark.slow
+def test_a_map_that_is_there_is_compared_without_computing_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study, out = tmp_path / "small.toml", tmp_path / "out"
+    text = (
+        'study = "map"\ndisk_radii_mm = [4.0, 5.0]\nprestretches = [1.0]\ncases = ["I"]\n'
+        'treatments = ["plain", "tension"]\n'
+    )
+    study.write_text(text)
+    asked: list[int] = []
+    computed = design.sweep
+
+    def counted(wanted: Sequence[Point], **options: Any) -> Swept:
+        asked.append(len(wanted))
+        return computed(wanted, **options)
+
+    def stopped(point: Point, row: Row) -> Shot:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(design, "sweep", counted)
+    monkeypatch.setattr(shooting, "shoot", stopped)
+    command = ["design", str(study), "--out", str(out), "--compare"]
+    assert CliRunner().invoke(main, command).exit_code != 0  # broken off in the comparison; the map is there
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert set(before) == {"small.csv", "small.png", "small.svg"}
+    monkeypatch.setattr(shooting, "shoot", lambda point, row: Shot(row, row.stroke, row.work, 7, 50.0, ""))
+    again = CliRunner().invoke(main, command)
+    assert again.exit_code == 0, again.output
+    assert asked == [4, 2]  # the whole map once, then the two plain actuators of the sample
+    assert "A sample by the paper's method" in again.output and "2 actuators here" in again.output
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    study.write_text(text.replace("5.0", "6.0"))
+    other = CliRunner().invoke(main, command)
+    assert other.exit_code == 2 and "not the map of this study" in " ".join(other.output.split())
+    study.write_text(text)
+    (out / "small.csv").write_bytes(before["small.csv"][:-40])
+    torn = CliRunner().invoke(main, command)
+    assert torn.exit_code == 2 and "not the map of this study" in " ".join(torn.output.split())
 
 
 @pytest.mark.slow
