@@ -417,6 +417,7 @@ class Engine:
                 elapsed = -regain_duration(self.rig, action)
             status = self._outlook.look(self._number, action, elapsed, label)
             self.control.left = status.left
+            self.control.measured = {} if self.recorder.keeping else status.measured(self.clock.now())
             self._show_status(status)
         except Exception as error:
             self._show_status = None

@@ -12,7 +12,7 @@ import math
 import os
 import select
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -90,6 +90,8 @@ class Control(StopRequest):
         What the run is doing, for whoever asks from another terminal.
     left : float
         Seconds that it still takes, by the plan; NaN while that is not known.
+    measured : mapping of str to float
+        What is measured now, the unit in the name, with the time ``t_s``; for where the log does not keep all of it.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class Control(StopRequest):
         self.answer: Answer | None = None
         self.doing = ""
         self.left = math.nan
+        self.measured: Mapping[str, float] = {}
         self._sources = tuple(sources)
         self._say = say
         self._next_look = 0.0
@@ -181,6 +184,7 @@ class Control(StopRequest):
             "question": question.shown if question is not None else "",
             "expected": question.expected if question is not None else "",
             "left_s": f"{self.left:.1f}" if math.isfinite(self.left) else "",
+            **{name: repr(value) for name, value in self.measured.items() if math.isfinite(value)},
         }
 
     def close(self) -> None:

@@ -56,6 +56,16 @@ class Status:
             line = f"{line} {word}"
         return line.rstrip(" |")
 
+    def measured(self, t: float) -> dict[str, float]:
+        """What is measured now, the unit in the names, with the run's time ``t`` (s)."""
+        return {
+            "t_s": t,
+            "force_N": self.force,
+            "displacement_m": self.displacement,
+            "voltage_V": self.voltage,
+            "current_A": self.current,
+        }
+
     @property
     def numbers(self) -> str:
         """What is measured, and the nearest limit."""

@@ -40,6 +40,13 @@ TOPICS = (
     *("/event", "/target"),
     *(f"/{name}/sample" for name in MONITORS),
 )
+# What a run says of itself, as the page has it: name, what it is of, factor.
+SAID = (
+    ("force_mN", "force_N", 1e3),
+    ("displacement_mm", "displacement_m", 1e3),
+    ("voltage_V", "voltage_V", 1.0),
+    ("current_uA", "current_A", 1e6),
+)
 
 
 class State(Enum):
@@ -119,8 +126,23 @@ class RunView:
                 if self._run is None:
                     self._run = live_run(self.path)
                 self._said = self._run.send("status")
+                self._take_said(self._said)
             except (RigError, OSError):
                 self._run, self._said = None, {}
+
+    def _take_said(self, said: dict[str, str]) -> None:
+        """What the run says that it measures now: where its log leaves most out (`rig.log.decimation`)."""
+        if "t_s" not in said:
+            return
+        with self._lock:
+            t = float(said["t_s"])
+            if not t > self._t:
+                return
+            self._arrived = time.monotonic()
+            for name, of, scale in SAID:
+                if of in said:
+                    self._add(name, np.array([t]), np.array([float(said[of]) * scale]))
+            self._t = t
 
     def _look_ahead(self) -> None:
         try:
