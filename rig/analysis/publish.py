@@ -236,18 +236,18 @@ def _metadata(recipe: Recipe, part: Path, places: Sequence[str], command: Sequen
         "description": f"{recipe.result.get('convention', '')} To fit again: {' '.join(command)}".strip(),
         "datePublished": now,
         "license": {"@id": about.license} if "://" in about.license else about.license,
-        "hasPart": _ids(files),
+        "hasPart": crate_ids(files),
         "mentions": {"@id": "#fit"},
-        "variableMeasured": _ids(one["@id"] for one in quantities),
+        "variableMeasured": crate_ids(one["@id"] for one in quantities),
     }
-    root |= {"author": _ids(one["@id"] for one in people)} if people else {}
+    root |= {"author": crate_ids(one["@id"] for one in people)} if people else {}
     action = {
         "@id": "#fit",
         "@type": "CreateAction",
         "name": f"dea-rig {recipe.command}",
         "description": " ".join(command),
-        "instrument": _ids(one["@id"] for one in software),
-        "object": _ids(places),
+        "instrument": crate_ids(one["@id"] for one in software),
+        "object": crate_ids(places),
         "result": {"@id": RESULT},
         "endTime": now,
     }
@@ -257,18 +257,25 @@ def _metadata(recipe: Recipe, part: Path, places: Sequence[str], command: Sequen
         "conformsTo": {"@id": PROFILE},
         "about": {"@id": "./"},
     }
-    graph = [about_itself, root, *(_file(part, name) for name in files), action, *software, *people, *quantities]
+    graph = [about_itself, root, *(crate_file(part, name) for name in files), action, *software, *people, *quantities]
     return json.dumps({"@context": CONTEXT, "@graph": graph}, indent=2, allow_nan=False) + "\n"
 
 
-def _ids(names: Any) -> list[dict[str, str]]:
+def crate_ids(names: Any) -> list[dict[str, str]]:
     return [{"@id": name} for name in names]
 
 
-FORMATS = {".json": "application/json", ".md": "text/markdown", ".toml": "application/toml", ".csv": "text/csv"}
+FORMATS = {
+    ".json": "application/json",
+    ".md": "text/markdown",
+    ".toml": "application/toml",
+    ".csv": "text/csv",
+    ".html": "text/html",
+}
 
 
-def _file(part: Path, name: str) -> dict[str, Any]:
+def crate_file(part: Path, name: str) -> dict[str, Any]:
+    """The entity of the file ``name`` in the folder ``part`` of a crate."""
     content = (part / name).read_bytes()
     return {
         "@id": name,

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
 
 from rig.base.text import printable
 from rig.campaign.campaign import Campaign
 from rig.campaign.progress import COMPLETE, Done, progress_of
+from rig.campaign.statistics import BOUNDS, Statistics, Value, plain, statistics_of
 from rig.log.reader import read_log
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+BOUNDS_WORDS = (
+    "A result that is a bound only (a film that bore the ceiling) is in none of these numbers: where there are such, "
+    "the mean is that of the films that broke, and too low for all. `dea-rig analyse breakdown` takes them into account."
+)
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,76 @@ def rows_of(campaign: Campaign) -> list[Row]:
                 results[fields["name"]] = (fields["value"], fields["standard_uncertainty"], fields["unit"])
                 found = fields["outcome"]
         rows.append(Row(one, results, found))
+    return rows
+
+
+def statistics(rows: list[Row], campaign: Campaign) -> list[Statistics]:
+    """Statistics of each result over all complete runs, in the order in which results first come."""
+    found: dict[tuple[str, str], list[Value]] = {}
+    for row in rows:
+        for run in row.done.runs:
+            if run.outcome != COMPLETE:
+                continue
+            messages = [message.fields for message in read_log(campaign.logs / run.log).messages("/result")]
+            steps = {kind: sorted({f["step"] for f in messages if f["kind"] == kind}) for kind in _kinds(messages)}
+            for f in messages:
+                place = f" (step {f['step']})" if len(steps[f["kind"]]) > 1 else ""
+                name = f"{f['kind']}: {plain(f['name'])}{place}"
+                bound = f["kind"] == "breakdown" and f["outcome"] in BOUNDS
+                one = row.done.specimen
+                at = datetime.fromisoformat(run.date).timestamp() if run.date else math.nan
+                found.setdefault((name, f["unit"]), []).append(Value(one.name, one.batch, at, f["value"], bound))
+    return [statistics_of(name, unit, values) for (name, unit), values in found.items()]
+
+
+def _kinds(messages: list[dict[str, Any]]) -> set[str]:
+    return {fields["kind"] for fields in messages}
+
+
+def certificate_problems(rows: list[Row], campaign: Campaign) -> dict[str, list[str]]:
+    """What spoke against the certificates in the runs of each specimen; of the others nothing is said."""
+    found: dict[str, list[str]] = {}
+    for row in rows:
+        for run in row.done.runs:
+            if run.outcome == "cannot be read":
+                continue
+            log = read_log(campaign.logs / run.log)
+            said = [message.fields["problem"] for message in log.messages("/certificate_problem")]
+            dated = log.metadata.get("run", {}).get("certificate_problems", "")
+            for problem in [*(text for text in dated.split("; ") if text), *said]:
+                mine = found.setdefault(row.done.specimen.name, [])
+                if problem not in mine:
+                    mine.append(problem)
+    return found
+
+
+def statistics_table(found: list[Statistics]) -> Table:
+    """Statistics for the terminal."""
+    from rich.table import Table
+
+    table = Table(title="Over all specimens", caption=BOUNDS_WORDS if any(one.bounds for one in found) else None)
+    for heading in ("result", "n", "mean (95 % interval)", "between", "within", "groups p", "drift per day", "bounds"):
+        table.add_column(heading, overflow="fold")
+    for cells in statistics_cells(found):
+        table.add_row(*map(printable, cells))
+    return table
+
+
+def statistics_cells(found: list[Statistics]) -> list[list[str]]:
+    """The same as text, one row a result."""
+
+    def known(value: float) -> str:
+        return f"{value:.3g}" if math.isfinite(value) else "-"
+
+    rows = []
+    for one in found:
+        interval = f" ({known(one.interval[0])} to {known(one.interval[1])})" if math.isfinite(one.interval[0]) else ""
+        drift = known(one.drift_per_day)
+        if math.isfinite(one.p_drift):
+            drift += f" +- {known(one.drift_uncertainty)}, p {known(one.p_drift)}"
+        name = f"{one.name} / {one.unit}"
+        numbers = [f"{known(one.mean)}{interval}", known(one.between), known(one.within), known(one.p_groups), drift]
+        rows.append([name, str(one.specimens), *numbers, str(one.bounds) if one.bounds else ""])
     return rows
 
 

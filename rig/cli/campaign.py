@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rig.cli.files import FILE, FILE_OR_STDIN, read_ports, tell_written
+from rig.cli.files import FILE, FILE_OR_STDIN, FOLDER, read_ports, tell_written
 
 if TYPE_CHECKING:
     from rig.campaign.campaign import Campaign
@@ -78,22 +78,38 @@ def status(campaign: Path) -> None:
 @command.command("report")
 @click.argument("campaign", type=FILE)
 @click.option("-o", "--out", type=FILE, help="The table as CSV, SI units in the headings.")
-def report(campaign: Path, out: Path | None) -> None:
-    """One row for each specimen of CAMPAIGN: how it ended, what was found, what the fit beside its log says."""
+@click.option("--page", type=FILE, help="One self-contained HTML page: table, statistics, pictures, certificates.")
+@click.option("--crate", type=FOLDER, help="Folder for all of it with logs and scenes as a research object (RO-Crate).")
+@click.option("--license", "license_", default="", metavar="URL", help="Terms of use, for the research object.")
+def report(campaign: Path, out: Path | None, page: Path | None, crate: Path | None, license_: str) -> None:
+    """One row for each specimen of CAMPAIGN, and over all of them: scatter, batches compared, drift over the days."""
     from rig.base.outputs import check_new, write_text
     from rig.campaign.campaign import load_campaign
-    from rig.campaign.report import as_csv, as_table, rows_of
+    from rig.campaign.report import as_csv, as_table, certificate_problems, rows_of, statistics, statistics_table
     from rig.cli.show import show
 
-    check_new(out)
+    check_new(out, page)
     loaded = load_campaign(campaign)
     rows = rows_of(loaded)
-    show(as_table(loaded, rows))
+    found = statistics(rows, loaded)
+    show(as_table(loaded, rows), *([statistics_table(found)] if found else []))
+    for name, problems in certificate_problems(rows, loaded).items():
+        click.echo(f"certificates of {name}: {'; '.join(problems)}")
     logs = loaded.table.logs
-    click.echo(f"Statistics between specimens: dea-rig fit {logs}, dea-rig analyse breakdown {logs}/*.mcap")
+    click.echo(f"More: dea-rig fit {logs}, dea-rig analyse breakdown {logs}/*.mcap")
+    if page is not None or crate is not None:
+        from rig.campaign.page import page as made
+
+        text = made(loaded, rows, found)
+        if crate is not None:
+            from rig.analysis.campaign_crate import PAGE, TABLE, write_crate
+
+            write_crate(loaded, rows, found, {TABLE: as_csv(rows), PAGE: text}, crate, license_)
+        if page is not None:
+            write_text(page, text)
     if out is not None:
         write_text(out, as_csv(rows))
-    tell_written(out)
+    tell_written(out, page, crate)
 
 
 def _go(
