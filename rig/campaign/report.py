@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 BOUNDS_WORDS = (
     "A result that is a bound only (a film that bore the ceiling) is in none of these numbers: where there are such, "
-    "the mean is that of the films that broke, and too low for all. `dea-rig analyse breakdown` takes them into account."
+    "the mean is that of the films that broke, and too low for all. `dea-rig analyse breakdown` takes all of them."
 )
 
 
