@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.assumed import UNKNOWN_CORRELATION
+from calibration.film.coordinates import Coordinates
 from calibration.film.curve import Curve
+from calibration.film.differences import DIMENSIONS, common, contrast_weights, contrasts, parts
 from calibration.film.reduction import (
     Block,
     NodeModel,
@@ -32,14 +33,6 @@ Array = NDArray[np.float64]
 NODES = 8  # of every part of a curve, to begin with
 COMPLIANCE_ROUNDS = 3  # rounds after which force and giving way agree; each is off by a few per cent of the one before
 TOLERANCE = 1e-7  # of the membrane solution, relative; far below any noise, so that nodes lie on one smooth curve
-PERMITTIVITY_BOUNDS = (0.5, 200.0)
-# Dimensions of a specimen, and the field of a curve with their relative standard uncertainty.
-DIMENSIONS = {
-    "thickness": "thickness_uncertainty",
-    "prestretch": "prestretch_uncertainty",
-    "disk_radius": "disk_radius_uncertainty",
-    "ring_radius": "ring_radius_uncertainty",
-}
 INVALID_RESIDUAL = 1e8  # where the membrane has no state; larger than any real residual
 
 
@@ -109,12 +102,6 @@ class Problem:
     ) -> None:
         self.curves = curves
         self.selections = selections
-        self.law = at.law
-        self.moduli, shapes = at.law.counts(terms)
-        self.film_numbers = self.moduli + shapes  # where eps_r stands in x
-        self.parameters = at.law.parameters(self.moduli, shapes)
-        self.material = at
-        self.scale = at.shear_modulus
         self.tolerance = tolerance
         self.wrinkling: Wrinkling = wrinkling
         self.along = {kind.key: kind for kind in along}
@@ -127,12 +114,13 @@ class Problem:
                 + "; ".join(_why_empty(c, s) for c, s in zip(curves, selections, strict=True))
             )
         self.electric = any(curves[i].nominal_voltage != 0.0 for i in self.active)
+        self.coordinates = here = Coordinates.of(at, terms, self.electric)
+        self.law, self.moduli, self.film_numbers = here.law, here.moduli, here.film_numbers
+        self.parameters, self.material, self.scale = here.parameters, at, here.scale
         self.nodes = np.array([chebyshev_nodes(part.low, part.high, nodes) for _, part in self.pieces])
         self.voltage = np.array([reference_voltage(curves[i], part.used) for i, part in self.pieces])
         self.nuisances = self._nuisances()
-        self.names = [f"g{n + 1}" for n in range(self.moduli)]
-        self.names += at.law.names(self.moduli, shapes)[self.moduli :]
-        self.names += ["eps_r"] if self.electric else []
+        self.names = list(here.names)
         self.film_parameters = len(self.names)
         self.names += [f"{nuisance.kind.replace('-', '_')}_{k}" for k, nuisance in enumerate(self.nuisances)]
 
@@ -189,43 +177,27 @@ class Problem:
         found += [Nuisance(key, run, kind.usual, ()) for key, kind in self.along.items() for run in runs]
         return found
 
+    @property
+    def fitted_curves(self) -> list[Curve]:
+        """The curve of every row."""
+        return [self.curves[i] for i in self.active]
+
     def parts(self, dimension: str) -> list[str]:
         """Which parts (films, disks, rings) have errors of their own of a dimension; see `Curve.part`."""
-        return list(dict.fromkeys(self.curves[i].part(dimension) for i in self.active))
-
-    def _correlation(self, dimension: str) -> float:
-        """Of the errors of a dimension of two parts: 0 where each film names its batch, else unknown."""
-        known = dimension == "thickness" and all(self.curves[i].batch for i in self.active)
-        return 0.0 if known else UNKNOWN_CORRELATION
+        return parts(self.fitted_curves, dimension)
 
     def common(self, dimension: str) -> float:
-        """Standard deviation of what the errors of a dimension have in common, in units of that of one part.
-
-        Errors ``w`` of K parts with equal correlations c are a common error of variance ``c + (1 - c)/K`` and K - 1
-        contrasts of variance 1 - c. Contrasts are fitted; the common error no data can tell from another film.
-        """
-        c, count = self._correlation(dimension), len(self.parts(dimension))
-        return math.sqrt(c + (1.0 - c) / count)
+        """Standard deviation of what the errors of a dimension have in common, in units of that of one part."""
+        return common(self.fitted_curves, dimension)
 
     def contrasts(self, dimension: str) -> Array:
         """What the contrasts of a dimension do to each part, in units of its uncertainty; (K, K - 1)."""
-        count = len(self.parts(dimension))
-        base = np.linalg.qr(np.column_stack((np.ones(count), np.eye(count)[:, : count - 1])))[0][:, 1:]
-        found: Array = base * math.sqrt(1.0 - self._correlation(dimension))
-        return found
+        return contrasts(self.fitted_curves, dimension)
 
     def _contrasts(self, dimension: str) -> list[Nuisance]:
-        parts = self.parts(dimension)
-        sizes = [getattr(self.curves[i], DIMENSIONS[dimension]) for i in self.active]
-        if len(parts) == 1 or not any(sizes):
-            return []
-        which = [parts.index(self.curves[i].part(dimension)) for i in self.active]
         rows = tuple(range(len(self.active)))
-        found = []
-        for k, mode in enumerate(self.contrasts(dimension).T):
-            weights = tuple(float(size * mode[group]) for size, group in zip(sizes, which, strict=True))
-            found.append(Nuisance(dimension, f"contrast {k + 1}", 1.0, rows, weights))
-        return found
+        weights = contrast_weights(self.fitted_curves, dimension)
+        return [Nuisance(dimension, f"contrast {k + 1}", 1.0, rows, one) for k, one in enumerate(weights)]
 
     @property
     def data_rows(self) -> int:
@@ -234,46 +206,25 @@ class Problem:
 
     def film(self, x: Array) -> Material:
         """The material of a parameter vector."""
-        n = self.film_numbers
-        alpha = x[self.moduli : n]
-        mu = self.scale * x[: self.moduli] / self.law.weights(alpha)[0]
-        eps_r = float(x[n]) if self.electric else self.material.eps_r
-        return Material(name="identified", mu=tuple(mu), alpha=tuple(alpha), eps_r=eps_r, law=self.law)
+        return self.coordinates.film(x)
 
     def vector(self, material: Material) -> Array:
         """The parameter vector of a material, nuisances at zero."""
-        mu, alpha = np.array(material.mu), np.array(material.alpha)
-        eps = [material.eps_r] if self.electric else []
-        shares = mu * self.law.weights(alpha)[0] / self.scale
-        return np.concatenate((shares, alpha, eps, np.zeros(len(self.nuisances))))
+        return np.concatenate((self.coordinates.vector(material), np.zeros(len(self.nuisances))))
 
     def bounds(self, x: Array) -> tuple[Array, Array]:
         """Lower and upper bounds of a parameter vector; exponents keep the sign they have in ``x``."""
-        n = self.film_numbers
-        lower, upper = np.full(x.size, -np.inf), np.full(x.size, np.inf)
-        lower[:n], upper[:n] = np.array([p.search for p in self.parameters]).T
-        mirrored = self.law.series & (np.arange(n) >= self.moduli) & (x[:n] < 0.0)
-        lower[:n], upper[:n] = np.where(mirrored, -upper[:n], lower[:n]), np.where(mirrored, -lower[:n], upper[:n])
-        if self.electric:
-            lower[n], upper[n] = PERMITTIVITY_BOUNDS
-        return lower, upper
+        free = np.full(len(self.nuisances), np.inf)
+        low, high = self.coordinates.bounds(x)
+        return np.concatenate((low, -free)), np.concatenate((high, free))
 
     def by_parameters(self, x: Array, by_mu: Array, by_alpha: Array, by_eps: Array) -> Array:
         """Derivatives by x (..., P) from those by mu (..., moduli), alpha (..., shapes) and eps_r (...).
 
         Nuisances get 0.
         """
-        alpha = x[..., self.moduli : self.film_numbers]
-        weighed = [self.law.weights(one) for one in alpha.reshape(math.prod(alpha.shape[:-1]), alpha.shape[-1])]
-        weight = np.array([w for w, _ in weighed]).reshape(*alpha.shape[:-1], self.moduli)
-        slope = np.array([by for _, by in weighed]).reshape(*weight.shape, alpha.shape[-1])
-        by_share = by_mu * self.scale / weight
-        through_mu = (by_share * x[..., : self.moduli] / weight)[..., None] * slope
-        parts = [by_share, by_alpha - through_mu.sum(axis=-2)]
-        if self.electric:
-            parts.append(by_eps[..., None])
-        parts.append(np.zeros((*by_mu.shape[:-1], len(self.nuisances))))
-        return np.concatenate(parts, axis=-1)
+        found = self.coordinates.by_parameters(x, by_mu, by_alpha, by_eps)
+        return np.concatenate((found, np.zeros((*by_mu.shape[:-1], len(self.nuisances)))), axis=-1)
 
     def residual(self, x: Array) -> Array:
         """Weighted residuals, model minus measurement: reduced data, then nuisances in units of their priors."""

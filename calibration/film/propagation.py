@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.misfit import likely
-from calibration.film.problem import DIMENSIONS, Problem
+from calibration.film.differences import DIMENSIONS
+from calibration.film.problem import Problem
 from calibration.film.result import Quantity, RigParameter, Stiffness, Suspect, verdict
 from calibration.film.systematic import systematic_rows
 from model.material.law import Law, stack

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.curve import Curve
-from calibration.film.problem import DIMENSIONS, Problem
+from calibration.film.differences import DIMENSIONS
+from calibration.film.problem import Problem
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.suspects.base import Context, Kind, Shape
-from model.membrane.solve import solve_many
+from model.material.law import stack
 
 Array = NDArray[np.float64]
 
@@ -20,11 +20,13 @@ NAME = "viscous film"
 def _viscous(context: Context) -> Sequence[Shape]:
     """What a Maxwell branch as stiff as the film itself adds, by its relaxation time.
 
-    The force of one is ``integral of exp(-(t - s)/tau) dF0`` over the history of its run, with the force ``F0`` at 0 V.
+    The force of one is ``integral of exp(-(t - s)/tau) dD`` over the history of its run. ``D`` is the force that it adds
+    to a move that leaves it no time: it rested in the pre-stretched film, so its energy is that of the stretches over
+    the pre-stretch (`model.membrane.history`).
     """
     if not context.timed:
         return []
-    rest = _at_rest(context)
+    rest = _instant(context)
     sums: list[dict[int, Array]] = [{} for _ in RELAXATION_S]
     for run, (begin, duration) in context.runs.items():
         mine = [k for k, row in enumerate(context.block_rows) if context.curves[row].run == run]
@@ -49,12 +51,16 @@ def _viscous(context: Context) -> Sequence[Shape]:
     return found
 
 
-def _at_rest(context: Context) -> Array:
-    """The model's force at the nodes at 0 V; where there is none, that at the curves' own voltages."""
-    specimens = np.empty((len(context.curves), 1), dtype=np.object_)
-    specimens[:, 0] = [curve.specimen.with_material(context.film) for curve in context.curves]
-    force = solve_many(specimens, context.nodes, tolerance=1e-6).force
-    return np.where(np.isfinite(force), force, context.force)
+def _instant(context: Context) -> Array:
+    """Force at the nodes that a branch as stiff as the film adds to a quick move from rest (N)."""
+    film = context.film
+    law = film.law(np.array(film.mu)[:, None], np.array(film.alpha).reshape(-1, 1))
+    rest = np.log([curve.specimen.prestretch for curve in context.curves])[:, None, None]
+
+    def energy(l1: Array, l2: Array, field: Array) -> Array:
+        return law.energy(stack(np.log(l1) - rest, np.log(l2) - rest))
+
+    return context.from_energy(energy)
 
 
 def _maxwell(step: float, elastic: Array) -> Array:

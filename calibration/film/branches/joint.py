@@ -1,0 +1,309 @@
+"""Law, permittivity and branches of a film together with the errors of the rig: residuals over whole histories.
+
+Residuals are those of mean forces (`record`), weighted by their noise and its correlation. The model is the exact one
+where it was last solved, and moves from there as the response to first order in the ratios does (`response`): what is
+left to correct is a small part of the branches' force, and two or three exact solutions bring the fit to its end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from calibration.film.branches.record import Bins, Record, correlation
+from calibration.film.branches.response import Around, Relaxed, Response, Slopes, with_branches
+from calibration.film.coordinates import Coordinates
+from calibration.film.curve import Curve
+from calibration.film.differences import DIMENSIONS, common, contrast_weights
+from calibration.film.systematic import SYSTEMATIC, stiffening
+from model.material.materials import Material
+
+Array = NDArray[np.float64]
+
+MOST_RATIO = 20.0
+TOLERANCE = 1e-4  # of the exact solution, of the peak
+NUMERICAL = 3e-5  # of the peak: error of the model and of the means that no sample's noise explains
+LONG = 20  # samples of a bin from which its noise tells correlations
+INNER, OUTER = 12, 4  # steps of Newton's method between exact solutions; exact solutions at most
+SETTLED = 0.05  # decrease of chi-square that is none
+LOST = 1e6  # residual where the film has no state
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """An error that is fitted along, in units of its stated uncertainty: kind, run, prior."""
+
+    kind: str
+    run: str
+    prior: float
+
+
+@dataclass(eq=False)
+class Point:
+    """A film with the errors of the rig, in the coordinates of a `Joint`, and what the model says there.
+
+    residual : (bins + nuisances,), jacobian : the same by x; slopes : of every record
+    """
+
+    x: Array
+    residual: Array
+    jacobian: Array
+    slopes: list[Slopes]
+
+    @property
+    def cost(self) -> float:
+        """Chi-square."""
+        return float(self.residual @ self.residual)
+
+
+class Joint:
+    """All records of one film, with a number of branches."""
+
+    def __init__(self, records: Sequence[Record], start: Material, terms: int, held: Sequence[str] = ()) -> None:
+        self.records = records
+        self.held = tuple(held)
+        electric = any(record.history[2].max() > 0.0 for record in records) and "eps_r" not in held
+        self.coordinates = Coordinates.of(start, terms, electric)
+        self.responses: list[Response] = []
+        self.bins: list[Bins] = []
+        for record in records:
+            specimen = record.errors.specimen.with_material(replace(start, branches=()))
+            _, h, v = record.history
+            relaxed = Relaxed(specimen, float(h.max()), float(v.max()))
+            bins = record.bins(relaxed.force)
+            self.bins.append(bins)
+            self.responses.append(Response(bins, specimen))
+        self.peak = max(float(np.abs(one.force).max()) for one in self.bins)
+        self.force = np.concatenate([one.force for one in self.bins])
+        self.sigma, self.excess, self.correlation_time = self._weights(start)
+        self.samples = sum(int(one.size.sum()) for one in self.bins)
+        self.nuisances = self._nuisances()
+        self.correction: list[Array] = [np.zeros(one.time.size) for one in self.bins]
+        self.around: list[Around] = []
+        self.solved = 0  # exact histories
+
+    # --- noise
+
+    def _weights(self, start: Material) -> tuple[Array, float, float]:
+        """Standard deviations of the mean forces; variance over the stated one, and samples an independent one."""
+        total, freedom, times, base = 0.0, 0, [], []
+        for one, response in zip(self.bins, self.responses, strict=True):
+            curve = one.record.errors
+            steep = Relaxed(response.film(start), response.highest, float(response.voltage.max()))(one.h, one.voltage)
+            moving = one.record.moving[one.segment]
+            single = np.hypot(curve.force_noise, steep["h"] * curve.displacement_noise * moving)
+            scaled = one.noise / single[one.number]
+            total += float(scaled @ scaled)
+            freedom += scaled.size - one.size.size
+            long = (one.size >= LONG)[one.number]
+            times.append(correlation(scaled[long], one.rows[long], LONG))
+            base.append(single / np.sqrt(one.size))
+        ratio = total / freedom if freedom > 0 else 1.0
+        excess = ratio if freedom > 0 and ratio > 1.0 + 3.0 * math.sqrt(2.0 / freedom) else 1.0
+        correlated = max(times, default=1.0)
+        sizes = np.concatenate([one.size for one in self.bins]).astype(float)
+        sigma = np.concatenate(base) * np.sqrt(excess * np.minimum(correlated, sizes))
+        return np.hypot(sigma, NUMERICAL * self.peak), excess, correlated
+
+    def _nuisances(self) -> list[Nuisance]:
+        found = []
+        for run in dict.fromkeys(record.run for record in self.records):
+            curves = [record.errors for record in self.records if record.run == run]
+            for kind, of in (
+                ("force_zero", "force_zero"),
+                ("displacement_zero", "displacement_zero"),
+                ("lag", "lag_uncertainty"),
+            ):
+                prior = max(getattr(curve, of) for curve in curves)
+                if prior > 0.0:
+                    found.append(Nuisance(kind, run, prior))
+        prior = max(record.errors.compliance_uncertainty for record in self.records)
+        if prior > 0.0:
+            found.append(Nuisance("compliance", "the rig", prior))
+        for dimension in DIMENSIONS:
+            weights = contrast_weights(self.curves, dimension)
+            found += [Nuisance(dimension, f"contrast {k + 1}", 1.0) for k in range(len(weights))]
+        return found
+
+    @property
+    def curves(self) -> list[Curve]:
+        """The stated errors of every record."""
+        return [record.errors for record in self.records]
+
+    # --- the vector
+
+    def count(self, x: Array) -> int:
+        """How many branches ``x`` has."""
+        return (x.size - len(self.coordinates.names) - len(self.nuisances)) // 2
+
+    def vector(self, material: Material, nuisances: Array | None = None) -> Array:
+        """``[film, ratios, log times, nuisances]`` of a film."""
+        ratio = [one.ratio for one in material.branches]
+        time = [math.log(one.time) for one in material.branches]
+        errors = np.zeros(len(self.nuisances)) if nuisances is None else nuisances
+        return np.concatenate((self.coordinates.vector(material), ratio, time, errors))
+
+    def film(self, x: Array) -> Material:
+        """The film with its branches."""
+        n, k = len(self.coordinates.names), self.count(x)
+        return with_branches(self.coordinates.film(x), x[n : n + k], np.exp(x[n + k : n + 2 * k]))
+
+    def window(self) -> tuple[float, float]:
+        """Shortest and longest relaxation time (s) that is looked for: two samples, and the length of the record."""
+        return 2.0 * min(one.period for one in self.records), max(one.span for one in self.records)
+
+    def bounds(self, x: Array) -> tuple[Array, Array]:
+        """Of a vector."""
+        low, high = self.coordinates.bounds(x)
+        k, errors = self.count(x), len(self.nuisances)
+        shortest, longest = (math.log(one) for one in self.window())
+        low = np.concatenate((low, np.zeros(k), np.full(k, shortest), np.full(errors, -np.inf)))
+        return low, np.concatenate((high, np.full(k, MOST_RATIO), np.full(k, longest), np.full(errors, np.inf)))
+
+    def varied(self, x: Array) -> NDArray[np.bool_]:
+        """Entries that are fitted."""
+        free = np.ones(x.size, dtype=np.bool_)
+        free[: len(self.coordinates.names)] = [name not in self.held for name in self.coordinates.names]
+        return free
+
+    # --- residuals
+
+    def settle(self, x: Array) -> None:
+        """Take what changes little (`response.Around`) from the film at ``x``."""
+        film = self.film(x)
+        self.around = [one.around(film) for one in self.responses]
+
+    def evaluate(self, x: Array) -> Point:
+        """Residuals and slopes at ``x``, the model as corrected by the last exact solution."""
+        film = self.film(x)
+        slopes = [one.slopes(film, around) for one, around in zip(self.responses, self.around, strict=True)]
+        columns, forces = [], []
+        errors = x[len(self.coordinates.names) + 2 * self.count(x) :]
+        for number, (one, record) in enumerate(zip(slopes, self.records, strict=True)):
+            column = self._columns(x, one, number, record)
+            add = column[:, column.shape[1] - len(self.nuisances) :] @ errors
+            columns.append(column)
+            forces.append(one.force + self.correction[number] + add)
+        force = np.concatenate(forces)
+        residual = np.concatenate(((force - self.force) / self.sigma, errors))
+        lost = ~np.isfinite(residual)
+        residual[lost] = LOST
+        jacobian = np.concatenate(columns) / self.sigma[:, None]
+        prior = np.eye(len(self.nuisances), x.size, x.size - len(self.nuisances))
+        jacobian = np.where(np.isfinite(jacobian), jacobian, 0.0)
+        return Point(x, residual, np.concatenate((jacobian, prior)), slopes)
+
+    def _columns(self, x: Array, one: Slopes, number: int, record: Record) -> Array:
+        """Derivatives of the force (N) of a record's bins by ``x``."""
+        moduli = self.coordinates.moduli
+        eps = one.relaxed["eps_r"]
+        film = self.coordinates.by_parameters(x[None], one.film[:, :moduli], one.film[:, moduli:], eps)
+        parts = [film, one.ratio, one.log_time]
+        for nuisance in self.nuisances:
+            parts.append(nuisance.prior * self._by_nuisance(nuisance, one, number, record)[:, None])
+        return np.concatenate(parts, axis=1)
+
+    def _by_nuisance(self, nuisance: Nuisance, one: Slopes, number: int, record: Record) -> Array:
+        bins = self.bins[number]
+        mine = 1.0 if nuisance.run in (record.run, "the rig") else 0.0
+        if nuisance.kind in DIMENSIONS:
+            weights = contrast_weights(self.curves, nuisance.kind)
+            found: Array = one.dimensions[nuisance.kind] * weights[int(nuisance.run.split()[-1]) - 1][number]
+            return found
+        if nuisance.kind == "force_zero":
+            return np.full(bins.time.size, mine)
+        # A move later or farther is answered by the film as stiff as it is at once.
+        stiff = one.relaxed["h"] + self._quick(one, bins)
+        if nuisance.kind == "displacement_zero":
+            return mine * one.relaxed["h"]
+        if nuisance.kind == "compliance":
+            return -one.force * one.relaxed["h"]
+        t, h, _ = record.history
+        speed = (np.diff(h) / np.diff(t))[bins.segment]
+        return -mine * stiff * speed
+
+    @staticmethod
+    def _quick(one: Slopes, bins: Bins) -> Array:
+        """What branches add to the stiffness against a quick move (N/m), from the force along the record's moves."""
+        extra = one.force - one.relaxed["force"]
+        h = np.where(bins.h > 0.02 * bins.h.max(), bins.h, math.inf)
+        found: Array = 2.0 * np.maximum(extra, 0.0) / h
+        return found
+
+    def exact(self, x: Array, point: Point) -> bool:
+        """Correct the model by the exact solution at ``x``; whether the film has a state everywhere."""
+        film, complete = self.film(x), True
+        for k, (one, response) in enumerate(zip(point.slopes, self.responses, strict=True)):
+            force = response.exact(film, TOLERANCE)
+            self.solved += 1
+            known = np.isfinite(force)
+            complete &= bool(known.all())
+            self.correction[k] = np.where(known, force - one.force, 0.0)
+        return complete
+
+    def systematic(self, point: Point) -> dict[str, Array]:
+        """What one standard uncertainty of gains and dimensions does to the residuals, by its entry in the budget."""
+        found = {}
+        nothing = np.zeros(len(self.nuisances))
+        for part, uncertainty, scales in SYSTEMATIC:
+            sizes = [float(getattr(curve, uncertainty)) for curve in self.curves]
+            shared = common(self.curves, scales) if scales in DIMENSIONS else 1.0
+            if any(sizes):
+                change = [size * shared * one.dimensions[scales] for size, one in zip(sizes, point.slopes, strict=True)]
+                found[part] = np.concatenate((np.concatenate(change) / self.sigma, nothing))
+        tilted = [stiffening(curve) for curve in self.curves]
+        if any(tilted):
+            change = [size * one.force for size, one in zip(tilted, point.slopes, strict=True)]
+            found["eccentricity"] = np.concatenate((np.concatenate(change) / self.sigma, nothing))
+        return found
+
+    # --- minimisation
+
+    def minimise(self, x: Array) -> Point:
+        """The minimum near ``x`` of the model as it is corrected (Levenberg & Marquardt, within bounds)."""
+        here = self.evaluate(x)
+        damping = 1e-4
+        for _ in range(INNER):
+            low, high = self.bounds(here.x)
+            free = self.varied(here.x)
+            norms = np.linalg.norm(here.jacobian, axis=0)
+            norms[norms == 0.0] = 1.0
+            better = None
+            for _ in range(6):
+                columns = (here.jacobian / norms)[:, free]
+                rows = np.concatenate((columns, math.sqrt(damping) * np.eye(columns.shape[1])))
+                right = np.concatenate((-here.residual, np.zeros(columns.shape[1])))
+                ends = ((low - here.x) * norms)[free] - 1e-9, ((high - here.x) * norms)[free] + 1e-9
+                step = lsq_linear(rows, right, bounds=ends, method="bvls" if free.sum() < 60 else "trf").x
+                trial = here.x.copy()
+                trial[free] += step / norms[free]
+                there = self.evaluate(np.clip(trial, low, high))
+                if there.cost < here.cost:
+                    better = there
+                    damping = max(damping / 10.0, 1e-9)
+                    break
+                damping *= 10.0
+            if better is None:
+                break
+            gain, here = here.cost - better.cost, better
+            if gain < SETTLED:
+                break
+        return here
+
+    def fit(self, x: Array) -> Point:
+        """The minimum near ``x`` of the exact model."""
+        self.settle(x)
+        here = self.minimise(x)
+        for _ in range(OUTER):
+            self.settle(here.x)
+            self.exact(here.x, self.evaluate(here.x))
+            before = self.evaluate(here.x)
+            here = self.minimise(here.x)
+            if before.cost - here.cost < SETTLED:
+                break
+        return here

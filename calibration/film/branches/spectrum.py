@@ -1,0 +1,207 @@
+"""How many branches a film has, as far as a record tells, and which others it could have unseen.
+
+A branch is searched for among many relaxation times, so it must explain more than its two numbers would by chance: AICc
+has to fall by `EARNED`, and what is left out has to be predicted no worse. One false branch in some hundred elastic films
+is left by that.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.film.branches.joint import Joint, Point
+from calibration.film.branches.response import with_branches
+from calibration.film.propagation import Covariance
+
+Array = NDArray[np.float64]
+
+EARNED = 7.0  # by which AICc must fall for another branch
+PREDICTED = 1.02  # what is left out may be predicted worse by this factor at most
+MOST = 3  # branches that are looked for
+PER_DECADE = 4  # relaxation times that a search tries
+GROUPS = 8  # parts of the records that are left out in turn
+ALMOST_SURE = 1.6449  # standard deviations that 95 of 100 stay below
+USUAL, FAR = 0.1, 0.5  # ratio of a branch that occurs; one that would not show below this ratio does not show
+DECADES_BEYOND = 1.0  # of the window, for branches that are not seen
+
+
+@dataclass(frozen=True, eq=False)
+class Count:
+    """A number of branches, fitted: AICc over its least, root mean square of what was left out over its noise."""
+
+    branches: int
+    point: Point
+    aicc: float
+    held_out: float
+
+
+def free_columns(joint: Joint, point: Point) -> NDArray[np.bool_]:
+    """Entries of x that are fitted and at no bound."""
+    low, high = joint.bounds(point.x)
+    span = np.where(np.isfinite(high - low), high - low, 1.0)
+    inside = np.minimum(point.x - low, high - point.x) > 1e-6 * span
+    return joint.varied(point.x) & inside
+
+
+def guess(joint: Joint, elastic: Point, count: int) -> Array | None:
+    """A start with ``count`` branches: the best relaxation times of a grid, all else to first order."""
+    film = joint.film(elastic.x)
+    times = grid(joint, 0.0)
+    added = [one.added(film, times) for one in joint.responses]
+    shapes = np.zeros((times.size, elastic.residual.size))
+    shapes[:, : joint.force.size] = np.concatenate(added, axis=1) / joint.sigma
+    # Shapes of law exponents are left alone: far from the minimum they excuse anything.
+    free = joint.varied(elastic.x)
+    free[joint.coordinates.moduli : joint.coordinates.film_numbers] = False
+    base, _ = np.linalg.qr(elastic.jacobian[:, free])
+    left = shapes.T - base @ (base.T @ shapes.T)
+    residual = elastic.residual - base @ (base.T @ elastic.residual)
+    gram, along = left.T @ left, -left.T @ residual
+    best, least, chosen = None, 0.0, None
+    for these in itertools.combinations(range(times.size), count):
+        pick = np.array(these)
+        own = gram[np.ix_(pick, pick)]
+        try:
+            ratio = np.linalg.solve(own + 1e-12 * np.trace(own) * np.eye(count), along[pick])
+        except np.linalg.LinAlgError:
+            continue
+        gain = -float(along[pick] @ ratio)
+        if (ratio > 0.0).all() and gain < least:
+            best, least, chosen = ratio, gain, pick
+    if best is None or chosen is None:
+        return None
+    # All else follows by least squares, and the ratios are over a film that is softer for it.
+    rest = elastic.residual + shapes[chosen].T @ best
+    step = np.linalg.lstsq(elastic.jacobian[:, free], -rest, rcond=None)[0]
+    x = elastic.x.copy()
+    x[free] += step
+    moduli = joint.coordinates.moduli
+    softer = float(x[:moduli].sum() / elastic.x[:moduli].sum())
+    if not 0.05 < softer < 1.5:
+        x, softer = elastic.x.copy(), 1.0
+    low, high = joint.coordinates.bounds(x)
+    x[: low.size] = np.clip(x[: low.size], low, high)
+    material = with_branches(joint.coordinates.film(x), best / softer, times[chosen])
+    return joint.vector(material, x[len(joint.coordinates.names) :])
+
+
+def grid(joint: Joint, beyond: float) -> Array:
+    """Relaxation times (s) over the window and ``beyond`` it by so many decades."""
+    shortest, longest = joint.window()
+    longest *= 10.0**beyond
+    return np.geomspace(shortest, longest, max(2, round(PER_DECADE * math.log10(longest / shortest)) + 1))
+
+
+def misfit(joint: Joint, point: Point) -> float:
+    """Chi-square over its freedom where that is no chance, times how many bins err together; 1 where it is."""
+    data = point.residual[: joint.force.size]
+    freedom = data.size - int(free_columns(joint, point)[: point.x.size - len(joint.nuisances)].sum())
+    ratio = float(data @ data) / max(1, freedom)
+    if not ratio > 1.0 + 3.0 * math.sqrt(2.0 / max(1, freedom)):
+        return 1.0
+    together = 1.0
+    for lag in range(1, data.size // 4):
+        rho = float(data[lag:] @ data[:-lag]) / float(data @ data)
+        if rho < 2.0 / math.sqrt(data.size):
+            break
+        together += 2.0 * rho
+    return ratio * together
+
+
+def aicc(joint: Joint, point: Point, scale: float) -> float:
+    """Of all samples, as those count that are independent; ``scale`` is the misfit of the richest model."""
+    effective = joint.samples / joint.correlation_time
+    numbers = int(free_columns(joint, point)[: point.x.size - len(joint.nuisances)].sum())
+    crowding = 2.0 * numbers * (numbers + 1) / max(1.0, effective - numbers - 1)
+    return point.cost / scale + 2.0 * numbers + crowding
+
+
+def held_out(joint: Joint, point: Point) -> float:
+    """Root mean square over noise of what a fit without it says of each part of the records (to first order)."""
+    free = free_columns(joint, point)
+    columns, total = point.jacobian[:, free], 0.0
+    count = joint.force.size
+    segments = np.concatenate([one.segment + 1000 * k for k, one in enumerate(joint.bins)])
+    order = np.unique(segments)
+    for mine in np.array_split(order, min(GROUPS, order.size)):
+        out = np.zeros(point.residual.size, dtype=np.bool_)
+        out[:count] = np.isin(segments, mine)
+        step = np.linalg.lstsq(columns[~out], -point.residual[~out], rcond=1e-10)[0]
+        there = point.residual[out] + columns[out] @ step
+        total += float(there @ there)
+    return math.sqrt(total / count)
+
+
+def count_branches(joint: Joint, start: Array, wanted: int | None) -> list[Count]:
+    """The film with 0, 1, ... branches up to those that pay, or without and with as many as are ``wanted``.
+
+    The last one is the answer.
+    """
+    elastic = joint.fit(start)
+    points = [elastic]
+    numbers = range(1, MOST + 1) if wanted is None else [wanted]
+    scale = 1.0
+    for number in numbers:
+        if number == 0:
+            break
+        first = guess(joint, elastic, number)
+        if first is None:
+            break
+        corrected = [one.copy() for one in joint.correction]
+        point = joint.fit(first)
+        scale = misfit(joint, point)
+        fewer = points[-1]
+        pays = aicc(joint, point, scale) < aicc(joint, fewer, scale) - EARNED
+        pays &= held_out(joint, point) < PREDICTED * held_out(joint, fewer)
+        if wanted is None and not pays:
+            joint.correction = corrected
+            joint.settle(fewer.x)
+            break
+        points.append(point)
+    criteria = [aicc(joint, one, scale) for one in points]
+    return [
+        Count(joint.count(one.x), one, value - min(criteria), held_out(joint, one))
+        for one, value in zip(points, criteria, strict=True)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Unseen:
+    """A branch more: its relaxation time (s), from which ratio on it would show (inf: none that occurs), its shape."""
+
+    time: float
+    shows_from: float
+    shape: Array
+
+    @property
+    def size(self) -> float:
+        """The largest ratio that may be there unseen; the usual one where none would show."""
+        return self.shows_from if math.isfinite(self.shows_from) else USUAL
+
+
+def unseen(joint: Joint, point: Point, scale: float) -> list[Unseen]:
+    """From which ratio on a further branch of each relaxation time would be found."""
+    free = free_columns(joint, point)
+    u, s, _ = np.linalg.svd(point.jacobian[:, free], full_matrices=False)
+    base = u[:, s > 1e-10 * s[0]]
+    times = grid(joint, DECADES_BEYOND)
+    film = joint.film(point.x)
+    found = []
+    shapes = np.concatenate([one.added(film, times) for one in joint.responses], axis=1) / joint.sigma
+    for time, shape in zip(times, shapes, strict=True):
+        rows = np.concatenate((shape, np.zeros(len(joint.nuisances))))
+        visible = float(np.linalg.norm(rows - base @ (base.T @ rows)))
+        needed = (math.sqrt(EARNED + 4.0) + ALMOST_SURE) * math.sqrt(scale)
+        size = needed / visible if visible > 1e-3 * float(np.linalg.norm(rows)) else math.inf
+        found.append(Unseen(float(time), size if size <= FAR else math.inf, rows))
+    return found
+
+
+def covariance(joint: Joint, point: Point) -> Covariance:
+    """Linear propagation at a minimum."""
+    return Covariance(point.jacobian, free_columns(joint, point))
