@@ -45,9 +45,7 @@ class Coordinates:
         names = [f"g{n + 1}" for n in range(moduli)]
         names += [*at.law.names(moduli, shapes)[moduli:], *(["eps_r"] if electric else [])]
         parameters = at.law.parameters(moduli, shapes)
-        return cls(
-            at.law, moduli, moduli + shapes, parameters, tuple(names), at.shear_modulus, electric, at.eps_r
-        )
+        return cls(at.law, moduli, moduli + shapes, parameters, tuple(names), at.shear_modulus, electric, at.eps_r)
 
     def film(self, x: Array) -> Material:
         """The material of a parameter vector."""

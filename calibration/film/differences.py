@@ -1,7 +1,7 @@
 """What dimensions of several specimens have in common, and how they differ.
 
-Errors ``w`` of K parts with equal correlations c are a common error of variance ``c + (1 - c)/K`` and K - 1 contrasts of
-variance 1 - c. Contrasts are fitted; the common error no data can tell from another film.
+Errors ``w`` of K parts with equal correlations c are a common error of variance ``c + (1 - c)/K`` and K - 1 contrasts
+of variance 1 - c. Contrasts are fitted; the common error no data can tell from another film.
 """
 
 from __future__ import annotations

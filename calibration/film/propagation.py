@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.misfit import likely
 from calibration.film.differences import DIMENSIONS
+from calibration.film.misfit import likely
 from calibration.film.problem import Problem
 from calibration.film.result import Quantity, RigParameter, Stiffness, Suspect, verdict
 from calibration.film.systematic import systematic_rows

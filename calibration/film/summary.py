@@ -30,6 +30,7 @@ from calibration.film.result import (
     Suspect,
     verdict,
 )
+from calibration.film.suspects.viscous import NAME as VISCOUS
 from calibration.rounding import percent
 from model.material.materials import Material
 from model.membrane.solve import solve_many
@@ -126,6 +127,7 @@ def summarise(
         provenance=provenance,
         assumed=assumed_parts(used_curves),
         measurement=most_useful(quantities, used_curves),
+        elastic_error=_elastic_error(doubts, stated.unseen, quantities),
     )
     if misfit > WRONG_MODEL:
         lost = {
@@ -142,7 +144,38 @@ def summarise(
             *notes,
         ]
         result = replace(result, quantities=lost)
+    if result.elastic_error:
+        result = replace(result, quantities={name: _viscous(one) for name, one in result.quantities.items()})
     return replace(result, warnings=[*_warnings(result, problem, fit), *notes])
+
+
+def _elastic_error(
+    doubts: Sequence[Suspect], unseen: Mapping[str, Mapping[str, float]], quantities: Mapping[str, Quantity]
+) -> dict[str, float]:
+    """By how much (relative) results are off by a viscosity that shows and was not fitted; empty where none does.
+
+    Other imperfections that cost energy look like it in part: it counts where it explains half as much as the best.
+    """
+    able = [one for one in doubts if one.possible and math.isfinite(one.uncertainty)]
+    viscous = [one for one in able if one.family == VISCOUS and one.significant]
+    if not viscous:
+        return {}
+
+    def explains(one: Suspect) -> float:
+        return (one.amplitude / one.uncertainty) ** 2
+
+    best = max(viscous, key=explains)
+    if explains(best) < 0.5 * max(explains(one) for one in able):
+        return {}
+    size = best.amplitude / best.unseen_size
+    return {name: size * shift / quantities[name].value for name, shift in unseen[best.name].items()}
+
+
+def _viscous(quantity: Quantity) -> Quantity:
+    """A quantity of a film that takes time, fitted as elastic: its doubt says so."""
+    if "viscous" in quantity.doubt or quantity.verdict == GOOD:
+        return quantity
+    return replace(quantity, doubt="; ".join(filter(None, (quantity.doubt, "viscous film, fitted as elastic"))))
 
 
 def doubted(
@@ -274,6 +307,12 @@ def _warnings(result: Identification, problem: Problem, fit: Fit) -> list[str]:
         keys = [key for key in dict.fromkeys(by_name[name].key for name in result.likely) if key]
         if keys:
             words.append(f"it can be fitted along: --along {' or --along '.join(keys)}")
+    if result.elastic_error:
+        shifts = " and ".join(f"{name} by about {100.0 * one:+.2g} %" for name, one in result.elastic_error.items())
+        words.append(
+            f"the film takes time (viscous) and was fitted as elastic, which shifts {shifts} (estimate of first "
+            "order); --branches auto fits its relaxation along"
+        )
     if problem.excess > 1.0:
         words.append(
             f"the samples scatter {result.noise_ratio:.2f} times as much as stated; "

@@ -119,7 +119,7 @@ def force_displacement(identification: Identification, curves: Sequence[Curve], 
         axes[0].set_ylabel("force F / N")
         axes[0].legend(handles=_legend(styles), loc="upper left")
 
-    return _svg(draw, width=4.2 * len(groups) if len(groups) > 1 else 5.4, height=3.7)
+    return svg(draw, width=4.2 * len(groups) if len(groups) > 1 else 5.4, height=3.7)
 
 
 def residuals(identification: Identification, curves: Sequence[Curve], selections: Sequence[Selection]) -> str:
@@ -147,7 +147,7 @@ def residuals(identification: Identification, curves: Sequence[Curve], selection
         axes[0, 0].set_ylim(-1.15 * largest, 1.15 * largest)
         figure.align_ylabels()
 
-    return _svg(draw, width=4.2 * max(len(groups), 1.3), height=0.7 + 1.75 * len(voltages))
+    return svg(draw, width=4.2 * max(len(groups), 1.3), height=0.7 + 1.75 * len(voltages))
 
 
 def stiffness(identification: Identification, truth: Material | None) -> str:
@@ -178,7 +178,7 @@ def stiffness(identification: Identification, truth: Material | None) -> str:
             ax.set_xlabel(f"meridional stretch $\\lambda_1$ (hoop stretch {curve.hoop_stretch:.3g})")
             ax.legend(loc="upper left")
 
-    return _svg(draw, width=8.4, height=3.2)
+    return svg(draw, width=8.4, height=3.2)
 
 
 def _styles(curves: Sequence[Curve]) -> dict[float, tuple[str, str, Any]]:
@@ -238,7 +238,7 @@ def _line(**style: Any) -> Any:
     return Line2D([], [], **style)
 
 
-def _svg(draw: Any, *, width: float, height: float) -> str:
+def svg(draw: Any, *, width: float, height: float) -> str:
     """Make a figure of the given size (inches), and return it as SVG text that is the same each time."""
     import matplotlib
     from matplotlib.figure import Figure

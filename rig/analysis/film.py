@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from rig.log.reader import Log
 from rig.scene.scene import Scene
 from rig.scene.specimen import SpecimenTable
 from rig.steps import registry
+
+if TYPE_CHECKING:
+    from calibration.film.branches.record import Record
 
 # Of a rig that nobody pressed on (m/N): load cells for a newton give way by some 0.3 mm at full scale.
 UNKNOWN_COMPLIANCE = 3e-4
@@ -70,6 +73,7 @@ def identify_logs(
     profiles: bool = False,
     wrinkled: str = "left-out",
     posterior: bool = False,
+    branches: int | Literal["auto"] = 0,
     progress: Callable[[float, float, str], None] = lambda done, total, label: None,
     **settings: Any,
 ) -> Found:
@@ -77,7 +81,8 @@ def identify_logs(
 
     ``law`` is the name of the law to fit, the scene's when not given. ``comparing`` judges 1, 2 and 3 Ogden terms
     beside each other, ``profiles`` adds 95 % intervals from profile likelihood; each takes a few seconds more.
-    ``posterior`` adds Markov chains, which take a minute or more and tell ``progress``. ``wrinkled`` is "left-out" or
+    ``posterior`` adds Markov chains, which take a minute or more and tell ``progress``. ``branches`` fits so many
+    Maxwell branches along, or as many as pay, from the whole histories of the runs. ``wrinkled`` is "left-out" or
     "tension-field". Other ``settings`` are those of `calibration.film.identify.identify`: ``fixed``,
     ``negative_exponents``, ``along``, ``fixed_stretch``.
 
@@ -101,6 +106,7 @@ def identify_logs(
     if len(set(hashes.values())) < len(paths):
         raise DataError("The same log is given twice; it would count as if it had been measured twice.")
     curves: list[Curve] = []
+    records: list[Record] = []
     try:
         for run, scene in zip(runs, scenes, strict=True):
             certificates = run.certificates
@@ -108,7 +114,10 @@ def identify_logs(
             found = run.curves(scene.specimen.specimen(), joining, **_errors(run, scene, certificates))
             corrected = [_without_compliance(curve, run, certificates) for curve in found]
             inside = [_in_calibrated_range(_at_its_voltage(curve), certificates) for curve in corrected]
-            curves += [_with_drift(curve, certificates) for curve in inside]
+            mine = [_with_drift(curve, certificates) for curve in inside]
+            curves += mine
+            if branches and mine:
+                records.append(_record(run, mine[0], certificates))
         if not curves:
             raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
     except CurveError as error:
@@ -121,6 +130,8 @@ def identify_logs(
         profiles=profiles,
         wrinkled=wrinkled,
         posterior=posterior,
+        branches=branches,
+        records=records,
         progress=progress,
         law=scenes[0].specimen.specimen().material.law if law is None else law_called(law),
         reach=min(scene.limits.displacement_mm for scene in scenes) * 1e-3,
@@ -138,6 +149,8 @@ def identify_curves(
     profiles: bool = False,
     wrinkled: str = "left-out",
     posterior: bool = False,
+    branches: int | Literal["auto"] = 0,
+    records: Sequence[Record] = (),
     progress: Callable[[float, float, str], None] = lambda done, total, label: None,
     law: type[Law] | None = None,
     reach: float = math.inf,
@@ -146,8 +159,8 @@ def identify_curves(
 ) -> Found:
     """Identify the film from curves, wherever they come from; options as in `identify_logs`.
 
-    ``law`` is that of the specimens' material when not given.
-    With ``each`` every specimen is fitted alone as well, and what scatters between them is told.
+    ``law`` is that of the specimens' material when not given. ``records`` are the whole runs, where they are known
+    beyond their curves. With ``each`` every specimen is fitted alone as well, and what scatters between them is told.
 
     Raises
     ------
@@ -167,7 +180,10 @@ def identify_curves(
     try:
         comparison = compare(curves, terms=counts, **options) if comparing else []
         same = [one for one in comparison if one.terms == terms]
-        identification = same[0] if same else identify(curves, terms=terms, **options)
+        if branches:
+            identification, curves = _with_branches(curves, records, branches, terms, options)
+        else:
+            identification = same[0] if same else identify(curves, terms=terms, **options)
         if posterior:
             from calibration.film.posterior import posterior as sample
 
@@ -176,6 +192,41 @@ def identify_curves(
         raise DataError(f"{error}.") from None
     found = Found(identification, curves, [], provenance, None, [], comparison)
     return replace(found, **_between(curves, terms, options)) if each else found
+
+
+def _with_branches(
+    curves: list[Curve],
+    records: Sequence[Record],
+    branches: int | Literal["auto"],
+    terms: int,
+    options: Mapping[str, Any],
+) -> tuple[Identification, list[Curve]]:
+    """The film with its branches, and the curves less what those add to the forces."""
+    from calibration.film.branches.identify import identify_branches
+    from calibration.film.branches.record import records_of_curves
+
+    number = None if branches == "auto" else branches
+    return identify_branches(records or records_of_curves(curves), curves, branches=number, terms=terms, **options)
+
+
+def _record(run: Run, like: Curve, certificates: Mapping[str, Certificate]) -> Record:
+    """The whole history of a run: measured from the beginning of the first recorded part to the end of the last."""
+    from calibration.film.branches.record import record_of
+
+    whole = replace(
+        like,
+        label=run.log.path.name,
+        h=run.h,
+        force=run.force,
+        voltage=run.voltage,
+        direction=np.zeros(run.t.size, dtype=np.int8),
+        time=run.t,
+        flagged=run.flagged,
+    )
+    whole = _in_calibrated_range(_without_compliance(whole, run, certificates), certificates)
+    recorded = np.flatnonzero(np.array([phase.record for phase in run.phases]))
+    first, last = run.phases[recorded[0]].t, recorded[-1] + 1
+    return record_of(whole, first, run.phases[last].t if last < len(run.phases) else math.inf)
 
 
 def _between(curves: list[Curve], terms: int, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -57,6 +57,10 @@ LEAST_SHARE = 0.01  # of a variance, for a line in the budget on screen
     show_default=True,
     help="By what: with charge the current that charges one film says it, whatever the film's stiffness does.",
 )
+@click.option(
+    "--branches",
+    help="Films that take time: fit so many Maxwell branches along (1 to 3), or as many as pay: auto.",
+)
 @click.option("--stiffness-at", help="Stretches of the stiffness that can be compared between runs, e.g. 1.5,1.2.")
 @click.option("--cards", type=FOLDER, help="Folder for material cards of Abaqus, Ansys, COMSOL and FEBio.")
 @import_options(cone=True)
@@ -75,6 +79,7 @@ def command(
     negative_exponents: bool,
     along: tuple[str, ...],
     permittivity: str,
+    branches: str | None,
     stiffness_at: str | None,
     cards: Path | None,
     dry_run: bool,
@@ -127,6 +132,7 @@ def command(
             "along": along,
             "each": each,
             "fixed_stretch": _stretches(stiffness_at),
+            "branches": _branches(branches, comparing=comparing, posterior=posterior, along=along),
         }
         if tables is not None and scene is not None:
             found = identify_cones(tables, logs, scene, **settings)
@@ -208,6 +214,21 @@ def _stretches(words: str | None) -> tuple[float, float] | None:
             param_hint="--stiffness-at",
         )
     return meridional, hoop
+
+
+def _branches(words: str | None, *, comparing: bool, posterior: bool, along: Sequence[str]) -> int | Literal["auto"]:
+    """How many branches; 0 without the option."""
+    if words is None:
+        return 0
+    if comparing or posterior or along:
+        raise click.UsageError(
+            "--branches goes without --compare, --posterior and --along: those are of elastic films."
+        )
+    if words.strip().lower() == "auto":
+        return "auto"
+    if words.strip() not in ("1", "2", "3"):
+        raise click.BadParameter(f"{words!r}: give 1, 2, 3, or auto", param_hint="--branches")
+    return int(words)
 
 
 def _check_source(paths: Sequence[Path], scene: Path | None, about_tables: bool) -> None:

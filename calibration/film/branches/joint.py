@@ -22,6 +22,7 @@ from calibration.film.curve import Curve
 from calibration.film.differences import DIMENSIONS, common, contrast_weights
 from calibration.film.systematic import SYSTEMATIC, stiffening
 from model.material.materials import Material
+from model.membrane.history import solve_histories
 
 Array = NDArray[np.float64]
 
@@ -237,14 +238,23 @@ class Joint:
 
     def exact(self, x: Array, point: Point) -> bool:
         """Correct the model by the exact solution at ``x``; whether the film has a state everywhere."""
-        film, complete = self.film(x), True
-        for k, (one, response) in enumerate(zip(point.slopes, self.responses, strict=True)):
-            force = response.exact(film, TOLERANCE)
-            self.solved += 1
+        complete = True
+        for k, (one, force) in enumerate(zip(point.slopes, self.solve(x), strict=True)):
             known = np.isfinite(force)
             complete &= bool(known.all())
             self.correction[k] = np.where(known, force - one.force, 0.0)
         return complete
+
+    def solve(self, x: Array, *, fine: bool = False) -> list[Array]:
+        """Exact forces (N) of every record at its bins, or at its fine times; NaN where the film has no state."""
+        film = self.film(x)
+        at = [one.fine if fine else one.bins.time for one in self.responses]
+        self.solved += 1
+        if not film.branches:
+            return [one.elastic(film, times) for one, times in zip(self.responses, at, strict=True)]
+        specimens = [one.film(film) for one in self.responses]
+        histories = [(one.t, one.h, one.voltage, times) for one, times in zip(self.responses, at, strict=True)]
+        return [one.force for one in solve_histories(specimens, histories, tolerance=TOLERANCE)]
 
     def systematic(self, point: Point) -> dict[str, Array]:
         """What one standard uncertainty of gains and dimensions does to the residuals, by its entry in the budget."""

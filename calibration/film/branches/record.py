@@ -8,15 +8,18 @@ time, so that neither the curvature of the force nor what the polygon leaves off
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.curve import Curve
+from calibration.film.curve import Curve, CurveError
+from calibration.film.reduction import CONTACT_MARGIN
 
 Array = NDArray[np.float64]
 Elastic = Callable[[Array, Array], Array]  # force (N) at displacements (m) and voltages (V)
@@ -177,7 +180,7 @@ def _edges(length: float, period: float) -> Array:
     for edge in both:
         if edge - kept[-1] >= min(first, length):
             kept.append(float(edge))
-    return np.array(kept[1:-1] + [length])
+    return np.array([*kept[1:-1], length])
 
 
 def _lines(time: Array, mean: Array, segment: NDArray[np.intp], t: Array, number: NDArray[np.intp]) -> Array:
@@ -260,7 +263,7 @@ def _sharpened(t: Array, knots: Array, values: tuple[Array, Array], allowed: lis
     lines: list[list[tuple[float, float]]] = []
     for one in values:
         mine = []
-        for left, right in zip(first[:-1], first[1:], strict=True):
+        for left, right in itertools.pairwise(first):
             rows = slice(left + 2, right - 2)
             if right - left < 12:
                 mine.append((math.nan, math.nan))
@@ -297,4 +300,42 @@ def _through(t: Array, values: Array, knots: Array) -> Array:
     band = np.zeros((2, n))
     band[0, 1:], band[1] = beside, own + weak
     found: Array = solveh_banded(band, right + weak * np.interp(knots, t, values))
+    return found
+
+
+def record_of(whole: Curve, first: float, last: float) -> Record:
+    """The record of a run from its samples from the beginning to the end, measured between two times (s).
+
+    ``whole`` is a curve of all samples of the run. What is not known of displacement and voltage in between is taken
+    from its neighbours; before the first reading the film rested flat.
+    """
+    t = whole.time
+    if t is None:
+        raise CurveError(f"{whole.label}: its samples have no time; branches need it")
+    order = np.unique(t, return_index=True)[1]
+    t = t[order]
+    filled = []
+    for values in (whole.h[order], whole.voltage[order]):
+        known = np.isfinite(values)
+        if not known.any():
+            raise CurveError(f"{whole.label}: no reading of displacement or voltage")
+        filled.append(np.interp(t, t[known], values[known], left=0.0))
+    used = whole.usable[order] & (t >= first) & (t <= last)
+    used &= whole.h[order] > max(CONTACT_MARGIN * whole.displacement_zero, 0.0)
+    return Record(whole, t, filled[0], filled[1], whole.force[order], used)
+
+
+_COLUMNS = ("h", "force", "voltage", "direction", "time", "flagged")
+
+
+def records_of_curves(curves: Sequence[Curve]) -> list[Record]:
+    """A record a run from its curves alone: between them disk and voltage went straight from one to the next."""
+    found = []
+    for run in dict.fromkeys(curve.run for curve in curves):
+        mine = [curve for curve in curves if curve.run == run]
+        if any(curve.time is None for curve in mine):
+            raise CurveError(f"{run}: its samples have no time; branches need it")
+        columns: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in mine]) for name in _COLUMNS}
+        whole = replace(mine[0], label=run, **columns)
+        found.append(record_of(whole, -math.inf, math.inf))
     return found

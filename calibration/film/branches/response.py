@@ -1,6 +1,6 @@
 """What a film with branches answers to the history of a record, and how that changes with its parameters.
 
-The answer is `model.membrane.history.solve_history`. Its slopes need be good to some per cent only: Newton's method
+The answer is `model.membrane.history`. Its slopes need be good to some per cent only: Newton's method
 with such slopes still ends where the exact residuals are orthogonal to them, and their error is one of the
 uncertainties by as many per cent. They are those of the relaxed film's motion: its logarithmic stretches ``u(R, t)``
 drive the branches point by point, and by virtual work a branch adds to the force, to first order in its ratio,
@@ -21,7 +21,6 @@ from scipy.interpolate import CubicSpline
 from calibration.film.branches.record import Bins
 from model.material.law import stack
 from model.material.materials import Branch, Material
-from model.membrane.history import solve_history
 from model.membrane.solve import profiles, solve_many
 from model.specimen import Specimen
 
@@ -57,7 +56,9 @@ class Relaxed:
         for level in table:
             known = np.isfinite(level).all(axis=1)
             if not known.all():  # beyond the last state: the last one's, as a start
-                level[:] = level[known][np.searchsorted(np.flatnonzero(known), np.arange(GRID)).clip(0, known.sum() - 1)]
+                level[:] = level[known][
+                    np.searchsorted(np.flatnonzero(known), np.arange(GRID)).clip(0, known.sum() - 1)
+                ]
         self.splines = [CubicSpline(self.h, level) for level in table]
 
     def __call__(self, h: Array, voltage: Array) -> dict[str, Array]:
@@ -114,8 +115,8 @@ class Motion:
         volume = 2.0 * math.pi * specimen.thickness / specimen.prestretch**2 * step
         self.weight = volume * simpson * found.R[0] ** 2
 
-    def forces(self, film: Material, t: Array, times: Sequence[float]) -> Array:
-        """What branches as stiff as the film add to the force (N), (times, len(t)); by the exponential rule, order 2."""
+    def forces(self, film: Material, t: Array, times: Sequence[float] | Array) -> Array:
+        """What branches as stiff as the film add to the force (N), (times, len(t)); exponential rule of order 2."""
         law = film.law(np.array(film.mu)[:, None], np.array(film.alpha).reshape(-1, 1))
         modulus, tau = film.shear_modulus, np.asarray(times, dtype=float)[:, None]
         w = np.zeros((2, tau.size, POINTS))
@@ -184,9 +185,7 @@ class Response:
     def __init__(self, bins: Bins, specimen: Specimen) -> None:
         self.bins, self.specimen = bins, specimen
         self.t, self.h, self.voltage = bins.record.history
-        pieces = [
-            np.linspace(left, right, FINE + 1)[:-1] for left, right in zip(self.t[:-1], self.t[1:], strict=True)
-        ]
+        pieces = [np.linspace(left, right, FINE + 1)[:-1] for left, right in zip(self.t[:-1], self.t[1:], strict=True)]
         self.fine = np.unique(np.concatenate((*pieces, bins.time, self.t[-1:])))
         self.fine_h = np.interp(self.fine, self.t, self.h)
         self.fine_v = np.interp(self.fine, self.t, self.voltage)
@@ -197,19 +196,17 @@ class Response:
         """The specimen of that material."""
         return self.specimen.with_material(material)
 
-    def exact(self, material: Material, tolerance: float, times: Array | None = None) -> Array:
-        """Force (N) at the bins, or at ``times``; NaN where there is no state."""
-        at = self.bins.time if times is None else times
-        if not material.branches:
-            h, v = np.interp(at, self.t, self.h), np.interp(at, self.t, self.voltage)
-            return solve_many(self.film(material), h, v, tolerance=max(1e-7, 0.01 * tolerance)).force
-        return solve_history(self.film(material), self.t, self.h, self.voltage, at, tolerance=tolerance).force
+    def elastic(self, material: Material, times: Array) -> Array:
+        """Force (N) of the relaxed film at ``times``; NaN where it has no state."""
+        plain = self.film(replace(material, branches=()))
+        h, v = np.interp(times, self.t, self.h), np.interp(times, self.t, self.voltage)
+        return solve_many(plain, h, v, tolerance=1e-6).force
 
     def motion(self, film: Specimen) -> Motion:
         """The relaxed film's motion along the record."""
         return Motion(film.with_material(replace(film.material, branches=())), self.fine_h, self.fine_v)
 
-    def added(self, material: Material, times: Sequence[float]) -> Array:
+    def added(self, material: Material, times: Sequence[float] | Array) -> Array:
         """What branches as stiff as the film add at the bins (N), (times, bins), to first order."""
         return self.motion(self.film(material)).forces(material, self.fine, times)[:, self.at]
 
@@ -279,7 +276,7 @@ def _moved(film: Material, number: int) -> tuple[Material, float]:
     return replace(film, mu=tuple(values[:moduli]), alpha=tuple(values[moduli:])), step
 
 
-def with_branches(material: Material, ratio: Sequence[float], time: Sequence[float]) -> Material:
+def with_branches(material: Material, ratio: Sequence[float] | Array, time: Sequence[float] | Array) -> Material:
     """The material with these branches."""
     pairs = zip(ratio, time, strict=True)
     return replace(material, branches=tuple(Branch(float(max(r, 0.0)), float(t)) for r, t in pairs))

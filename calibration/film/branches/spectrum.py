@@ -1,14 +1,15 @@
 """How many branches a film has, as far as a record tells, and which others it could have unseen.
 
 A branch is searched for among many relaxation times, so it must explain more than its two numbers would by chance: AICc
-has to fall by `EARNED`, and what is left out has to be predicted no worse. One false branch in some hundred elastic films
-is left by that.
+has to fall by `EARNED`, and what is left out has to be predicted no worse. That leaves one false branch in some hundred
+elastic films.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +28,7 @@ PER_DECADE = 4  # relaxation times that a search tries
 GROUPS = 8  # parts of the records that are left out in turn
 ALMOST_SURE = 1.6449  # standard deviations that 95 of 100 stay below
 USUAL, FAR = 0.1, 0.5  # ratio of a branch that occurs; one that would not show below this ratio does not show
-DECADES_BEYOND = 1.0  # of the window, for branches that are not seen
+DECADES_BEYOND = 1.3  # of the window, for branches that are not seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,46 +49,46 @@ def free_columns(joint: Joint, point: Point) -> NDArray[np.bool_]:
     return joint.varied(point.x) & inside
 
 
-def guess(joint: Joint, elastic: Point, count: int) -> Array | None:
-    """A start with ``count`` branches: the best relaxation times of a grid, all else to first order."""
-    film = joint.film(elastic.x)
+def guess(joint: Joint, from_: Point, more: int) -> Array | None:
+    """A start with so many branches ``more`` than a fit has: the best times of a grid, all else to first order.
+
+    None where they would explain too little to be worth it. Of the law the modulus alone may change: exponents far from
+    their minimum excuse anything.
+    """
+    x, moduli = from_.x, joint.coordinates.moduli
     times = grid(joint, 0.0)
+    film = joint.film(x)
+    shapes = np.zeros((times.size, from_.residual.size))
     added = [one.added(film, times) for one in joint.responses]
-    shapes = np.zeros((times.size, elastic.residual.size))
     shapes[:, : joint.force.size] = np.concatenate(added, axis=1) / joint.sigma
-    # Shapes of law exponents are left alone: far from the minimum they excuse anything.
-    free = joint.varied(elastic.x)
-    free[joint.coordinates.moduli : joint.coordinates.film_numbers] = False
-    base, _ = np.linalg.qr(elastic.jacobian[:, free])
+    others = joint.varied(x)
+    others[: joint.coordinates.film_numbers] = False
+    columns = np.column_stack((from_.jacobian[:, :moduli] @ x[:moduli], from_.jacobian[:, others]))
+    base, _ = np.linalg.qr(columns)
     left = shapes.T - base @ (base.T @ shapes.T)
-    residual = elastic.residual - base @ (base.T @ elastic.residual)
+    residual = from_.residual - base @ (base.T @ from_.residual)
     gram, along = left.T @ left, -left.T @ residual
     best, least, chosen = None, 0.0, None
-    for these in itertools.combinations(range(times.size), count):
+    for these in itertools.combinations(range(times.size), more):
         pick = np.array(these)
         own = gram[np.ix_(pick, pick)]
-        try:
-            ratio = np.linalg.solve(own + 1e-12 * np.trace(own) * np.eye(count), along[pick])
-        except np.linalg.LinAlgError:
-            continue
+        ratio = np.linalg.solve(own + 1e-9 * np.diag(np.diag(own)), along[pick])
         gain = -float(along[pick] @ ratio)
         if (ratio > 0.0).all() and gain < least:
             best, least, chosen = ratio, gain, pick
-    if best is None or chosen is None:
+    if best is None or chosen is None or -least < EARNED + 4.0:
         return None
-    # All else follows by least squares, and the ratios are over a film that is softer for it.
-    rest = elastic.residual + shapes[chosen].T @ best
-    step = np.linalg.lstsq(elastic.jacobian[:, free], -rest, rcond=None)[0]
-    x = elastic.x.copy()
-    x[free] += step
-    moduli = joint.coordinates.moduli
-    softer = float(x[:moduli].sum() / elastic.x[:moduli].sum())
-    if not 0.05 < softer < 1.5:
-        x, softer = elastic.x.copy(), 1.0
-    low, high = joint.coordinates.bounds(x)
-    x[: low.size] = np.clip(x[: low.size], low, high)
-    material = with_branches(joint.coordinates.film(x), best / softer, times[chosen])
-    return joint.vector(material, x[len(joint.coordinates.names) :])
+    step = np.linalg.lstsq(columns, -from_.residual - shapes[chosen].T @ best, rcond=None)[0]
+    softer = float(np.clip(1.0 + step[0], 0.1, 1.5))
+    start = x.copy()
+    start[others] += step[1:]
+    start[:moduli] *= softer
+    low, high = joint.bounds(start)
+    start = np.clip(start, low, high)
+    n, k = len(joint.coordinates.names), joint.count(x)
+    ratio = np.concatenate((start[n : n + k], best / softer))
+    time = np.concatenate((np.exp(start[n + k : n + 2 * k]), times[chosen]))
+    return joint.vector(with_branches(joint.coordinates.film(start), ratio, time), start[n + 2 * k :])
 
 
 def grid(joint: Joint, beyond: float) -> Array:
@@ -144,23 +145,18 @@ def count_branches(joint: Joint, start: Array, wanted: int | None) -> list[Count
     """
     elastic = joint.fit(start)
     points = [elastic]
-    numbers = range(1, MOST + 1) if wanted is None else [wanted]
     scale = 1.0
-    for number in numbers:
-        if number == 0:
-            break
-        first = guess(joint, elastic, number)
-        if first is None:
-            break
-        corrected = [one.copy() for one in joint.correction]
-        point = joint.fit(first)
-        scale = misfit(joint, point)
+    for number in range(1, (MOST if wanted is None else wanted) + 1):
         fewer = points[-1]
+        corrected, around = [one.copy() for one in joint.correction], joint.around
+        point = _fitted(joint, points, number)
+        if point is None:
+            break
+        scale = misfit(joint, point)
         pays = aicc(joint, point, scale) < aicc(joint, fewer, scale) - EARNED
         pays &= held_out(joint, point) < PREDICTED * held_out(joint, fewer)
         if wanted is None and not pays:
-            joint.correction = corrected
-            joint.settle(fewer.x)
+            joint.correction, joint.around = corrected, around
             break
         points.append(point)
     criteria = [aicc(joint, one, scale) for one in points]
@@ -168,6 +164,19 @@ def count_branches(joint: Joint, start: Array, wanted: int | None) -> list[Count
         Count(joint.count(one.x), one, value - min(criteria), held_out(joint, one))
         for one, value in zip(points, criteria, strict=True)
     ]
+
+
+def _fitted(joint: Joint, points: Sequence[Point], number: int) -> Point | None:
+    """The fit with so many branches, begun from the elastic one or from that with one branch less."""
+    starts = [guess(joint, points[0], number), guess(joint, points[-1], 1) if number > 1 else None]
+    best, least = None, math.inf
+    for start in starts:
+        if start is not None:
+            joint.settle(start)
+            cost = joint.evaluate(start).cost
+            if cost < least:
+                best, least = start, cost
+    return None if best is None else joint.fit(best)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,9 +193,12 @@ class Unseen:
         return self.shows_from if math.isfinite(self.shows_from) else USUAL
 
 
-def unseen(joint: Joint, point: Point, scale: float) -> list[Unseen]:
-    """From which ratio on a further branch of each relaxation time would be found."""
+def unseen(joint: Joint, point: Point, scale: float, *, alone: bool = False) -> list[Unseen]:
+    """From which ratio on a further branch of each relaxation time would be found, or any if it were ``alone``."""
     free = free_columns(joint, point)
+    if alone:
+        first, count = len(joint.coordinates.names), joint.count(point.x)
+        free[first : first + 2 * count] = False
     u, s, _ = np.linalg.svd(point.jacobian[:, free], full_matrices=False)
     base = u[:, s > 1e-10 * s[0]]
     times = grid(joint, DECADES_BEYOND)
@@ -203,5 +215,10 @@ def unseen(joint: Joint, point: Point, scale: float) -> list[Unseen]:
 
 
 def covariance(joint: Joint, point: Point) -> Covariance:
-    """Linear propagation at a minimum."""
-    return Covariance(point.jacobian, free_columns(joint, point))
+    """Linear propagation at a minimum; the shape parameters lie in their ranges (rectangular: JCGM 100:2008, 4.3.7)."""
+    first, last = joint.coordinates.moduli, joint.coordinates.film_numbers
+    width = np.array([high - low for low, high in (one.search for one in joint.coordinates.parameters[first:])])
+    known = np.eye(last - first, point.x.size, first)
+    if width.size:
+        known = known * (math.sqrt(12.0) / width)[:, None]
+    return Covariance(np.concatenate((point.jacobian, known)), free_columns(joint, point))

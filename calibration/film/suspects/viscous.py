@@ -20,9 +20,9 @@ NAME = "viscous film"
 def _viscous(context: Context) -> Sequence[Shape]:
     """What a Maxwell branch as stiff as the film itself adds, by its relaxation time.
 
-    The force of one is ``integral of exp(-(t - s)/tau) dD`` over the history of its run. ``D`` is the force that it adds
-    to a move that leaves it no time: it rested in the pre-stretched film, so its energy is that of the stretches over
-    the pre-stretch (`model.membrane.history`).
+    The force of one is ``integral of exp(-(t - s)/tau) dD`` over the history of its run. ``D`` is the force that it
+    adds to a move that leaves it no time: it rested in the pre-stretched film, so its energy is that of the stretches
+    over the pre-stretch (`model.membrane.history`).
     """
     if not context.timed:
         return []

@@ -11,12 +11,14 @@ second order in dt, and exact at small strain. The balance at the end of each st
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solve_banded
 
 Array = NDArray[np.float64]
@@ -47,9 +49,7 @@ class ViscousCone:
         found = np.zeros((5, *u.shape[1:]))
         for mu, alpha in zip(self.mu, self.alpha, strict=True):
             one, two, thin = np.exp(alpha * u[0]), np.exp(alpha * u[1]), np.exp(-alpha * (u[0] + u[1]))
-            found += mu * np.array(
-                (one - thin, two - thin, alpha * (one + thin), alpha * thin, alpha * (two + thin))
-            )
+            found += mu * np.array((one - thin, two - thin, alpha * (one + thin), alpha * thin, alpha * (two + thin)))
         return tuple(found)  # type: ignore[return-value]
 
     def excess(self, w: Array) -> Array:
@@ -62,12 +62,12 @@ class ViscousCone:
         """Force along a piecewise linear history from rest, with ``moves`` steps in the shortest kind of stretch."""
         times = [np.array([t[0]])]
         shortest = min([time for _, time in self.branches], default=1.0)
-        for left, right in zip(t[:-1], t[1:], strict=True):
+        for left, right in itertools.pairwise(t):
             length = right - left
             even = np.linspace(0.0, length, moves + 1)[1:]
             early = np.geomspace(min(0.02 * shortest, length / moves), length, moves + 1)
             times.append(left + np.unique(np.concatenate((even, early))))
-        at = np.unique(np.round(np.concatenate(times), 9))
+        at = np.unique(np.round(np.concatenate(times), 6))
         heights, volts = np.interp(at, t, h), np.interp(at, t, voltage)
         return Trace(at, heights, volts, self._march(at, heights, volts))
 
@@ -84,8 +84,10 @@ class ViscousCone:
         for k in range(at.size):
             dt = at[k] - at[k - 1] if k else 0.0
             z = z + (heights[k] - z[0]) * shape
-            drive = [(np.exp(-dt / tau), -np.expm1(-dt / tau) / (dt / tau) if dt else 1.0, dt / tau)
-                     for _, tau in self.branches]
+            drive = [
+                (np.exp(-dt / tau), -np.expm1(-dt / tau) / (dt / tau) if dt else 1.0, dt / tau)
+                for _, tau in self.branches
+            ]
             before = [self.excess(one) for one in w]
             mean = before
             for _ in range(2 if dt and self.branches else 1):
@@ -99,8 +101,16 @@ class ViscousCone:
         return force
 
     def _balance(
-        self, r: Array, z: Array, old: Array, base: list[Array], drive: list[tuple[float, float, float]],
-        volts: float, width: Array, middle: Array, weight: Array,
+        self,
+        r: Array,
+        z: Array,
+        old: Array,
+        base: list[Array],
+        drive: list[tuple[float, float, float]],
+        volts: float,
+        width: Array,
+        middle: Array,
+        weight: Array,
     ) -> tuple[Array, Array, Array, float]:
         n = self.elements
         r, z = r.copy(), z.copy()
@@ -166,5 +176,5 @@ class Trace:
 
     def at(self, times: Array) -> Array:
         """Force at other times, by interpolation."""
-        found: Array = np.interp(times, self.t, self.force)
+        found: Array = PchipInterpolator(self.t, self.force)(times)
         return found
