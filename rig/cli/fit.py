@@ -132,7 +132,7 @@ def command(
             "along": along,
             "each": each,
             "fixed_stretch": _stretches(stiffness_at),
-            "branches": _branches(branches, comparing=comparing, posterior=posterior, along=along),
+            "branches": _branches(branches, elastic=comparing or posterior or bool(along) or permittivity == "charge"),
         }
         if tables is not None and scene is not None:
             found = identify_cones(tables, logs, scene, **settings)
@@ -216,13 +216,14 @@ def _stretches(words: str | None) -> tuple[float, float] | None:
     return meridional, hoop
 
 
-def _branches(words: str | None, *, comparing: bool, posterior: bool, along: Sequence[str]) -> int | Literal["auto"]:
-    """How many branches; 0 without the option."""
+def _branches(words: str | None, *, elastic: bool) -> int | Literal["auto"]:
+    """How many branches; 0 without the option. Options that are of ``elastic`` films do not go with it."""
     if words is None:
         return 0
-    if comparing or posterior or along:
+    if elastic:
         raise click.UsageError(
-            "--branches goes without --compare, --posterior and --along: those are of elastic films."
+            "--branches goes without --compare, --posterior, --along and --permittivity charge: those are of elastic "
+            "films."
         )
     if words.strip().lower() == "auto":
         return "auto"
