@@ -16,7 +16,7 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from drivers.links.port_lock import remove_if_empty, user_directory
+from drivers.links.own_directory import remove_if_empty, user_directory
 
 LARGEST = 4096  # bytes of such a file
 LOOPBACK = "127.0.0.1"

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from drivers.links.port_lock import remove_if_empty, user_directory
+from drivers.links.own_directory import remove_if_empty, user_directory
 from drivers.roles import GivesBack
 from rig.base.errors import ConfigError
 from rig.base.outputs import write_text

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.links.port_lock import user_directory
+from drivers.links.own_directory import user_directory
 from rig.base.errors import ConfigError
 
 LONGEST = 1024  # bytes of a request

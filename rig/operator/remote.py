@@ -15,7 +15,7 @@ import secrets
 import socket
 from pathlib import Path
 
-from drivers.links.port_lock import remove_if_empty
+from drivers.links.own_directory import remove_if_empty
 from rig.operator.control import Control
 from rig.operator.live import LONGEST, run_directory
 

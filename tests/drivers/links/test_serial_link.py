@@ -15,7 +15,8 @@ import pytest
 import serial
 
 from drivers.links.link import ByteLink, DeviceError, DeviceLost
-from drivers.links.port_lock import PortLock, user_directory
+from drivers.links.own_directory import user_directory
+from drivers.links.port_lock import PortLock
 from drivers.links.serial_link import TAKES_S, SerialLink
 
 pty = pytest.importorskip("pty", reason="pseudo-terminals are POSIX")
