@@ -62,8 +62,9 @@ static double margin(Problem *problem, const Grid *grid, const State *state, dou
     Points at;
     Edges edge;
     Stress law;
-    evaluate(problem, grid, state, &at);
-    edges(problem, grid, &at, lam, &edge);
+    evaluate(problem, grid, state, NULL, &at);
+    Solved solved = {1, grid, &at, NULL};
+    edges(problem, &solved, lam, &edge);
     memcpy(log1 + 1, at.log, sizeof(double) * (size_t)points);
     memcpy(hoop + 1, at.log + points, sizeof(double) * (size_t)points);
     log1[0] = edge.log1[0];
@@ -119,7 +120,7 @@ static int connected(Problem *problem, const Table *check, const Grid *of, const
     State end = *state, begun;
     Grid grid;
     prolong(of->table, check, of->table->check, &end);
-    lay(&grid, check, problem->span);
+    lay(&grid, check, CHECK_MODES, -problem->span, 0.0);
     int good = between(problem, &grid, &end);
     if (!good) {
         double field = problem->field;

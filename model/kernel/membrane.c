@@ -1,9 +1,11 @@
 /* The membrane's equilibrium, many states after one another: the kernel of model/membrane/solve.py.
 
-   It treats films of one element whose every point is taut and that are on the branch from rest by a look at their
-   energy, or by few steps of the voltage; every other state is left to the methods for arrays (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so
+   It treats taut films of one element that are on the branch from rest by a look at their energy, or by few steps of the
+   voltage, and wrinkled ones that the voltage does not soften; every other state is left to the methods for arrays
+   (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so
    that nothing depends on the others. */
 #include "connected.h"
+#include "tension_field.h"
 
 #ifdef _WIN32
 #define EXPORT __declspec(dllexport)
@@ -31,9 +33,17 @@ typedef struct {
 typedef struct {
     double force, peak_field, peak_field_radius, min_hoop_stress, min_meridional_stress, max_stretch, error_estimate;
     double lam; /* the force over its unit */
-    int64_t status, iterations, modes, mechanical, electric;
+    int64_t status, iterations, modes, mechanical, electric, relaxed;
     Slopes dforce;
 } Answer;
+
+/* The unknowns of a solved state: modes of every element and then the strains at its ends, slopes, natural widths. */
+typedef struct {
+    int64_t elements, folded[MOST_ELEMENTS];
+    double breaks[MOST_ELEMENTS + 1];
+    State state[MOST_ELEMENTS];
+    double natural[MOST_ELEMENTS][MOST_POINTS];
+} Kept;
 
 /* What all states of a call share: _Task of model/membrane/compiled.py. */
 typedef struct {
@@ -42,6 +52,8 @@ typedef struct {
     int64_t relaxed, sensitivities;
     double tolerance;
 } Task;
+
+static double sign_of(double x) { return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : 0.0; }
 
 static int is_positive(double x) { return x > 0.0 && x < INFINITY; }
 
@@ -60,7 +72,7 @@ static void pose(const Film *film, double h, double voltage, Problem *problem) {
     problem->log_prestretch = log_of(film->prestretch);
     problem->span = log_of(film->ring_radius / film->disk_radius);
     problem->height = h == 0.0 ? FLAT_HEIGHT : fabs(h) / film->ring_radius;
-    problem->mechanical = problem->electric = 0;
+    problem->mechanical = problem->electric = problem->relaxed = 0;
 }
 
 /* Whether the film, stretched like a straight cone both ways, would push outwards: no tension can hold it. */
@@ -75,7 +87,7 @@ static int is_slack(Problem *problem) {
 
 /* The answer in SI units. */
 static void place(const Film *film, const Problem *problem, double h, double voltage, const Extremes *x, Answer *out) {
-    double sign = h > 0.0 ? 1.0 : h < 0.0 ? -1.0 : 0.0;
+    double sign = sign_of(h);
     double b = film->ring_radius, t = film->thickness, lp = film->prestretch, shear = film->shear_modulus;
     out->force = TWO_PI * b * t * shear / (lp * lp) * out->lam * sign;
     out->peak_field = fabs(voltage) / t * exp_of(x->log_area);
@@ -85,11 +97,12 @@ static void place(const Film *film, const Problem *problem, double h, double vol
     out->max_stretch = exp_of(x->log_stretch);
     out->mechanical = problem->mechanical;
     out->electric = problem->electric;
+    out->relaxed = problem->relaxed;
 }
 
 /* The derivatives in SI units. */
 static void place_slopes(const Film *film, double h, double voltage, const Derivatives *d, Answer *out) {
-    double sign = h > 0.0 ? 1.0 : h < 0.0 ? -1.0 : 0.0;
+    double sign = sign_of(h);
     double a = film->disk_radius, b = film->ring_radius, t = film->thickness;
     double lp = film->prestretch, shear = film->shear_modulus, force = out->force;
     double unit = TWO_PI * t * shear / (lp * lp), scale = b * unit * sign;
@@ -105,10 +118,62 @@ static void place_slopes(const Film *film, double h, double voltage, const Deriv
     for (int64_t k = 0; k < film->law.shapes; k++) f->alpha[k] = scale * d->alpha[k];
 }
 
+static void keep_plain(const Grid *grid, const State *state, Kept *kept) {
+    kept->elements = 1;
+    kept->folded[0] = 0;
+    kept->breaks[0] = grid->left;
+    kept->breaks[1] = grid->right;
+    kept->state[0] = *state;
+}
+
+static void keep_cut(const Cut *cut, Kept *kept) {
+    kept->elements = cut->elements;
+    memcpy(kept->folded, cut->folded, sizeof kept->folded);
+    memcpy(kept->breaks, cut->breaks, sizeof kept->breaks);
+    memcpy(kept->state, cut->state, sizeof kept->state);
+    memcpy(kept->natural, cut->natural, sizeof kept->natural);
+}
+
+/* Write what a solved state says; returns its status, or LEFT_TO_OTHERS where its numbers overflow. */
+static int64_t place_all(const Film *film, Problem *problem, double h, double voltage, const Extremes *x, const Iterate *found,
+                         int64_t modes, int wrinkled, Answer *out) {
+    out->lam = found->lam;
+    out->iterations = found->steps;
+    out->modes = modes;
+    place(film, problem, h, voltage, x, out);
+    if (!(fabs(out->force) + out->peak_field + fabs(out->min_hoop_stress) + out->max_stretch < INFINITY))
+        return LEFT_TO_OTHERS;
+    return wrinkled ? WRINKLED : TAUT;
+}
+
+/* A state that is wrinkled by the plain equations, at the points `at`. */
+static int64_t wrinkled_answer(const Task *task, const Film *film, Problem *problem, double h, double voltage, Iterate *found,
+                               const Grid *grid, const State *state, Answer *out, Kept *kept) {
+    Cut cut;
+    Points plain, at[MOST_ELEMENTS];
+    Extremes x;
+    evaluate(problem, grid, state, NULL, &plain);
+    int status = fold(problem, task->tables, task->first_modes, task->tolerance, grid, state, &plain, &cut, at, found,
+                      &out->error_estimate);
+    if (status != WRINKLED) return status;
+    Solved solved = {cut.elements, cut.grid, at, cut.folded};
+    extremes(problem, &solved, found->lam, &x);
+    if (!(x.meridional > 0.0) || !(x.softening <= SOFTENING)) return LEFT_TO_OTHERS; /* soft ones are followed, all */
+    int64_t placed = place_all(film, problem, h, voltage, &x, found, modes_of(&cut), 1, out);
+    if (task->sensitivities) {
+        Derivatives d;
+        cut_derivatives(problem, &cut, at, found->lam, &d);
+        place_slopes(film, h, voltage, &d, out);
+    }
+    if (kept) keep_cut(&cut, kept);
+    return placed;
+}
+
 /* One state. Returns its status; `out` has numbers where that is TAUT or WRINKLED. */
-static int64_t answer(const Task *task, const Film *film, double h, double voltage, Answer *out, State *state) {
+static int64_t answer(const Task *task, const Film *film, double h, double voltage, Answer *out, Kept *kept) {
     Problem problem;
     Grid grid;
+    State state;
     Iterate found;
     Points at;
     Extremes x;
@@ -117,32 +182,33 @@ static int64_t answer(const Task *task, const Film *film, double h, double volta
     if (!(problem.span > 0.0 && problem.span <= LONGEST) || !is_positive(problem.height) || is_slack(&problem))
         return LEFT_TO_OTHERS;
     int64_t first = task->first_modes[problem.span <= 2.4 ? 0 : problem.span <= 3.1 ? 1 : 2];
-    int status = refine(&problem, task->tables, first, task->tolerance, task->relaxed != 0, &grid, state, &found,
+    int status = refine(&problem, task->tables, first, task->tolerance, task->relaxed != 0, &grid, &state, &found,
                         &out->error_estimate);
+    if (status == FOLDED) return wrinkled_answer(task, film, &problem, h, voltage, &found, &grid, &state, out, kept);
     if (status != TAUT) return status;
-    evaluate(&problem, &grid, state, &at);
-    extremes(&problem, &grid, &at, found.lam, &x);
+    evaluate(&problem, &grid, &state, NULL, &at);
+    Solved solved = {1, &grid, &at, NULL};
+    extremes(&problem, &solved, found.lam, &x);
     int wrinkled = !(x.hoop >= ROUND_OFF_TENSION * x.meridional);
-    if (!(x.meridional > 0.0) || (wrinkled && task->relaxed)) return LEFT_TO_OTHERS;
-    if (!(x.softening <= SOFTENING) && !connected(&problem, task->tables[CHECK_MODES], &grid, state, found.lam))
+    if (wrinkled && task->relaxed)
+        return wrinkled_answer(task, film, &problem, h, voltage, &found, &grid, &state, out, kept);
+    if (!(x.meridional > 0.0)) return LEFT_TO_OTHERS;
+    if (!(x.softening <= SOFTENING) && !connected(&problem, task->tables[CHECK_MODES], &grid, &state, found.lam))
         return LEFT_TO_OTHERS;
-    out->lam = found.lam;
-    out->iterations = found.steps;
-    out->modes = grid.table->modes;
-    place(film, &problem, h, voltage, &x, out);
-    if (!(fabs(out->force) + out->peak_field + fabs(out->min_hoop_stress) + out->max_stretch < INFINITY))
-        return LEFT_TO_OTHERS;
+    int64_t placed = place_all(film, &problem, h, voltage, &x, &found, grid.table->modes, wrinkled, out);
     if (task->sensitivities) {
         Reduced system;
         Step by_height;
-        Derivatives d;
-        reduce(&grid, state->w, &at, &system);
-        factor(grid.table->modes, &system);
+        Derivatives d = {{0.0}, {0.0}, 0.0, 0.0, 0.0, 0.0};
+        reduce(&grid, state.w, &at, &system);
+        factor(grid.table->modes, system.coupling, system.give, system.matrix, system.diagonal);
         tangent(&grid, &system, &by_height);
-        derivatives(&problem, &grid, state, &at, found.lam, &by_height, &d);
+        d.height = by_height.lam;
+        add_derivatives(&problem, &grid, state.w, &at, 0, found.lam, by_height.dc, by_height.dw, by_height.lam, &d);
         place_slopes(film, h, voltage, &d, out);
     }
-    return wrinkled ? WRINKLED : TAUT;
+    if (kept) keep_plain(&grid, &state, kept);
+    return placed;
 }
 
 static int is_task(const Task *task) {
@@ -159,15 +225,14 @@ static int is_task(const Task *task) {
 /* Solve the states (films[which[s]], h[s], voltage[s]), in SI units; `kept` takes their unknowns, or is NULL. Returns how
    many states have no answer here, or -1 where the task itself makes no sense. */
 EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t film_count, const int64_t *which,
-                                int64_t states, const double *h, const double *voltage, Answer *answers, State *kept) {
+                                int64_t states, const double *h, const double *voltage, Answer *answers, Kept *kept) {
     int64_t left = 0;
     if (!is_task(task)) return -1;
     for (int64_t s = 0; s < states; s++) {
-        State state;
         Answer *out = &answers[s];
         out->status = LEFT_TO_OTHERS;
         if (which[s] >= 0 && which[s] < film_count)
-            out->status = answer(task, &films[which[s]], h[s], voltage[s], out, kept ? &kept[s] : &state);
+            out->status = answer(task, &films[which[s]], h[s], voltage[s], out, kept ? &kept[s] : NULL);
         if (out->status < 0) left++;
     }
     return left;

@@ -15,7 +15,7 @@ enum { MOST_STEPS = 25 };
 #define LONGEST 4.0
 
 /* What a state came to; the first two are numbers of model.membrane.solution.Status. */
-enum { TAUT = 0, WRINKLED = 1, LEFT_TO_OTHERS = -1, NEEDS_TABLE = -2 };
+enum { TAUT = 0, WRINKLED = 1, LEFT_TO_OTHERS = -1, NEEDS_TABLE = -2, FOLDED = -3 };
 
 /* A state after Newton at one resolution. */
 typedef struct {
@@ -36,8 +36,8 @@ static double goal(double tolerance) {
 }
 
 /* Estimated relative error of `now`, after the force `previous` at the resolution before. */
-static double estimate(const Iterate *now, double previous, double tolerance) {
-    double refined = LEVEL_FACTOR * fabs((now->lam - previous) / now->lam);
+static double estimate(const Iterate *now, double previous, double tolerance, double factor) {
+    double refined = factor * fabs((now->lam - previous) / now->lam);
     return refined + NEWTON_FACTOR * (now->change * now->change) + now->tail + (ROUND_OFF + LEAST_SHARE * tolerance);
 }
 
@@ -88,7 +88,7 @@ static Iterate newton(Problem *problem, const Grid *grid, State *state, double a
     Step step;
     Iterate found = {NAN, NAN, NAN, NAN, 0, 0};
     while (found.steps < limit) {
-        evaluate(problem, grid, state, &at);
+        evaluate(problem, grid, state, NULL, &at);
         newton_step(problem, grid, state->w, &at, &system, &step);
         found.steps++;
         found.change = advance(grid, &at, &step, problem->field != 0.0, state);
@@ -122,27 +122,28 @@ static void prolong(const Table *from, const Table *to, const double *matrix, St
 }
 
 /* The state to `tolerance`, at the resolution that it needs. `tables` has one for so many modes at that place, or none.
-   `relaxed`: a state whose hoop stress is clearly negative is left to others at once. */
+   `relaxed`: a state whose hoop stress is clearly negative is FOLDED at once. */
 static int refine(Problem *problem, const Table *const *tables, int64_t modes, double tolerance, int relaxed, Grid *grid,
                   State *state, Iterate *found, double *error) {
     double aim = goal(tolerance), previous = NAN;
     int64_t steps = 0;
     if (!tables[modes]) return NEEDS_TABLE;
-    lay(grid, tables[modes], problem->span);
+    lay(grid, tables[modes], modes, -problem->span, 0.0);
     guess(problem, grid, state);
     for (;;) {
         *found = newton(problem, grid, state, aim, MOST_STEPS);
         steps += found->steps;
         found->steps = steps;
-        if (!found->ok || (relaxed && found->hoop <= CLEARLY_NEGATIVE)) return LEFT_TO_OTHERS;
-        *error = estimate(found, previous, tolerance);
+        if (relaxed && found->hoop <= CLEARLY_NEGATIVE) return FOLDED;
+        if (!found->ok) return LEFT_TO_OTHERS;
+        *error = estimate(found, previous, tolerance, LEVEL_FACTOR);
         if (*error <= tolerance) return TAUT;
         previous = found->lam;
         const Table *now = grid->table;
         if (now->next > MOST_MODES) return LEFT_TO_OTHERS;
         if (!tables[now->next]) return NEEDS_TABLE;
         prolong(now, tables[now->next], now->carry, state);
-        lay(grid, tables[now->next], problem->span);
+        lay(grid, tables[now->next], now->next, -problem->span, 0.0);
     }
 }
 

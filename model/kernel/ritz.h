@@ -1,5 +1,5 @@
-/* The Ritz form of the membrane problem and its Newton step: model/membrane/ritz.py, for one state whose film is one
-   element, taut everywhere. Equations stand there; names are the same.
+/* The Ritz form of the membrane problem and its Newton step: model/membrane/ritz.py, for one state. Equations stand
+   there; names are the same. What stands here is about one element; a taut film has no other.
 
    x = ln(R/b) in [-span, 0]. Unknowns: e = r/R - 1 as a sum of modes (coefficients c), the slope w = -dz/dR at every
    point, and the force lam. q = dr/dR - 1 = e + de/dx. */
@@ -11,19 +11,25 @@
 enum {
     MOST_MODES = 36,
     MOST_POINTS = MOST_MODES + 3,
-    MOST_PAIRS = MOST_MODES * (MOST_MODES + 1) / 2,
+    MOST_ELEMENTS = 5,
+    MOST_FUNCTIONS = MOST_MODES + 2, /* with the hats */
+    MOST_PAIRS = MOST_FUNCTIONS * (MOST_FUNCTIONS + 1) / 2,
 };
 
-/* Modes and quadrature on [-1, 1], made by model/membrane/compiled.py: N modes, Q points, rows before columns. */
+/* Modes and quadrature on [-1, 1], made by model/membrane/compiled.py: N modes, then two hats, make
+   F = N + 2 functions; Q points; rows before columns. */
 typedef struct {
     int64_t modes, points;
     int64_t next;             /* modes of the next resolution */
     const double *xi;         /* (Q) */
     const double *weight;     /* (Q) */
-    const double *values;     /* (2, N, Q): modes at the points, their derivatives in xi */
-    const double *project;    /* (Q, 2, N): the same, point by point */
-    const double *pairs;      /* (Q, 3, N (N+1)/2): products of two modes; one with the other's derivative; both */
+    const double *values;     /* (2, F, Q): functions at the points, their derivatives in xi */
+    const double *project;    /* (Q, 2, F): the same, point by point */
+    const double *pairs;      /* (Q, 3, F (F+1)/2): products of two functions; one with the other's derivative; both */
     const double *ends;       /* (2, Q): extrapolation to xi = -1 and 1 */
+    const double *end_slopes; /* (2, Q): derivative there */
+    const double *integrate;  /* (Q, Q): integral from -1 to each point */
+    const double *to_modes;   /* (N, Q): modes of a function whose derivative is given */
     const double *edge_tests; /* (2, 2, Q): test functions of disk and ring, each with its derivative */
     const double *fine;       /* (Q, FINE): interpolation to the FINE points */
     const double *fine_xi;    /* (FINE) */
@@ -37,12 +43,14 @@ typedef struct {
     Law law;
     double field; /* eps (V/T)^2 / G; 0 without voltage */
     double log_prestretch, span, height;
-    int64_t mechanical, electric;
+    int64_t mechanical, electric, relaxed;
 } Problem;
 
-/* A table laid on the film. */
+/* A table laid on an element between two values of x; with its hats where it has neighbours. */
 typedef struct {
     const Table *table;
+    int64_t functions;
+    double left, right;
     double radius[MOST_POINTS]; /* R/b */
     double once[MOST_POINTS];   /* weight dx R */
     double twice[MOST_POINTS];  /* weight dx R^2 */
@@ -50,7 +58,7 @@ typedef struct {
 } Grid;
 
 typedef struct {
-    double c[MOST_MODES];
+    double c[MOST_FUNCTIONS];
     double w[MOST_POINTS];
 } State;
 
@@ -63,13 +71,15 @@ typedef struct {
     double down[MOST_POINTS];   /* dL1/dw */
     double around[MOST_POINTS]; /* dL2/de */
     double metric[MOST_POINTS]; /* p^2 + w^2 */
+    double hoop[MOST_POINTS];   /* ln(lp r/R), the same as L2 but where relaxed */
+    double rate[MOST_POINTS];   /* dL2/dL1 where relaxed */
 } Points;
 
 /* The Newton system after the slopes are eliminated: height = reach + give lam - coupling . dc. */
 typedef struct {
     double matrix[MOST_PAIRS]; /* lower triangle, row by row; after `factor` L below the diagonal and D on it */
-    double diagonal[MOST_MODES];
-    double residual[MOST_MODES], coupling[MOST_MODES];
+    double diagonal[MOST_FUNCTIONS];
+    double residual[MOST_FUNCTIONS], coupling[MOST_FUNCTIONS];
     double give, reach;
     double hw[MOST_POINTS], kqw[MOST_POINTS], kew[MOST_POINTS], gw[MOST_POINTS];
     int positive;
@@ -77,17 +87,20 @@ typedef struct {
 
 /* One Newton step: the change of the state and the force after it. */
 typedef struct {
-    double dc[MOST_MODES], dw[MOST_POINTS];
+    double dc[MOST_FUNCTIONS], dw[MOST_POINTS];
     double lam;
     int stable;
 } Step;
 
-static void lay(Grid *grid, const Table *table, double span) {
-    double half = 0.5 * span;
+static void lay(Grid *grid, const Table *table, int64_t functions, double left, double right) {
+    double half = 0.5 * (right - left);
     grid->table = table;
+    grid->functions = functions;
+    grid->left = left;
+    grid->right = right;
     grid->dxi = 1.0 / half;
     for (int64_t i = 0; i < table->points; i++) {
-        double radius = exp_of(half * (table->xi[i] - 1.0));
+        double radius = exp_of(half * (table->xi[i] - 1.0) + right);
         double once = table->weight[i] * half * radius;
         grid->radius[i] = radius;
         grid->once[i] = once;
@@ -97,10 +110,10 @@ static void lay(Grid *grid, const Table *table, double span) {
 
 /* e and q at the points, or their changes, from the modes' coefficients. */
 static void strain(const Grid *grid, const double *c, double *e, double *q) {
-    int64_t points = grid->table->points, modes = grid->table->modes;
+    int64_t points = grid->table->points, every = grid->table->modes + 2;
     for (int64_t i = 0; i < points; i++) e[i] = q[i] = 0.0;
-    for (int64_t k = 0; k < modes; k++) {
-        const double *value = grid->table->values + k * points, *slope = value + modes * points;
+    for (int64_t k = 0; k < grid->functions; k++) {
+        const double *value = grid->table->values + k * points, *slope = value + every * points;
         for (int64_t i = 0; i < points; i++) {
             e[i] += c[k] * value[i];
             q[i] += c[k] * slope[i];
@@ -127,8 +140,23 @@ static void stress(Problem *problem, int64_t n, const double *log, Stress *out) 
     }
 }
 
-/* Strains, stresses and tangents of a state. */
-static void evaluate(Problem *problem, const Grid *grid, const State *state, Points *at) {
+/* The law with the hoop stretch eliminated, so that the hoop stress is zero: `relax` in model/material/law.py. Leaves
+   dL2 = change + rate dL1; returns whether a natural hoop stretch exists everywhere. */
+static int relax(int64_t n, Stress *law, double *change, double *rate) {
+    int regular = 1;
+    for (int64_t i = 0; i < n; i++) {
+        if (!(law->h22[i] > 0.0)) regular = 0;
+        rate[i] = -law->h12[i] / law->h22[i];
+        change[i] = -law->t2[i] / law->h22[i];
+        law->t1[i] += law->h12[i] * change[i];
+        law->h11[i] += law->h12[i] * rate[i];
+        law->t2[i] = law->h12[i] = law->h22[i] = 0.0;
+    }
+    return regular;
+}
+
+/* Strains, stresses and tangents of a state; of a relaxed element with its `natural` ln(l2), else NULL. */
+static void evaluate(Problem *problem, const Grid *grid, const State *state, const double *natural, Points *at) {
     int64_t n = grid->table->points;
     strain(grid, state->c, at->e, at->q);
     for (int64_t i = 0; i < n; i++) {
@@ -143,12 +171,17 @@ static void evaluate(Problem *problem, const Grid *grid, const State *state, Poi
     for (int64_t i = 0; i < 2 * n; i++) at->log[i] = log1p_of(at->log[i]);
     for (int64_t i = 0; i < n; i++) {
         double log1 = 0.5 * at->log[i] + problem->log_prestretch;
-        double log2 = at->log[n + i] + problem->log_prestretch;
+        at->hoop[i] = at->log[n + i] + problem->log_prestretch;
+        double log2 = natural ? natural[i] : at->hoop[i];
         at->log[i] = log1;
         at->log[n + i] = log2;
         at->log[2 * n + i] = -(log1 + log2);
     }
     stress(problem, n, at->log, &at->law);
+    double change[MOST_POINTS];
+    if (!natural) return;
+    relax(n, &at->law, change, at->rate);
+    problem->relaxed += n;
 }
 
 /* `sum over points of ee e e' + eq (e q' + q e') + qq q q'` for every pair of modes, and of `on_e e + on_q q`. The
@@ -157,18 +190,18 @@ typedef struct {
     double pair[3][MOST_POINTS], coupling[2][MOST_POINTS], residual[2][MOST_POINTS];
 } Weights;
 
-static void assemble(const Table *table, const Weights *on, Reduced *system) {
-    int64_t modes = table->modes, pairs = modes * (modes + 1) / 2;
-    for (int64_t k = 0; k < modes; k++) system->coupling[k] = system->residual[k] = 0.0;
+static void assemble(const Table *table, int64_t functions, const Weights *on, Reduced *system) {
+    int64_t every = table->modes + 2, stride = every * (every + 1) / 2, pairs = functions * (functions + 1) / 2;
+    for (int64_t k = 0; k < functions; k++) system->coupling[k] = system->residual[k] = 0.0;
     for (int64_t p = 0; p < pairs; p++) system->matrix[p] = 0.0;
     for (int64_t i = 0; i < table->points; i++) {
-        const double *value = table->project + 2 * i * modes, *slope = value + modes;
+        const double *value = table->project + 2 * i * every, *slope = value + every;
         double c0 = on->coupling[0][i], c1 = on->coupling[1][i], r0 = on->residual[0][i], r1 = on->residual[1][i];
-        for (int64_t k = 0; k < modes; k++) {
+        for (int64_t k = 0; k < functions; k++) {
             system->coupling[k] += c0 * value[k] + c1 * slope[k];
             system->residual[k] += r0 * value[k] + r1 * slope[k];
         }
-        const double *both = table->pairs + 3 * i * pairs, *mixed = both + pairs, *slopes = mixed + pairs;
+        const double *both = table->pairs + 3 * i * stride, *mixed = both + stride, *slopes = mixed + stride;
         double m0 = on->pair[0][i], m1 = on->pair[1][i], m2 = on->pair[2][i];
         for (int64_t p = 0; p < pairs; p++) system->matrix[p] += m0 * both[p] + m1 * mixed[p] + m2 * slopes[p];
     }
@@ -207,7 +240,7 @@ static void reduce(const Grid *grid, const double *w, const Points *at, Reduced 
         system->kew[i] = kew;
         system->gw[i] = gw;
     }
-    assemble(grid->table, &on, system);
+    assemble(grid->table, grid->functions, &on, system);
     system->give = system->reach = 0.0;
     system->positive = 1;
     for (int64_t i = 0; i < n; i++) {
@@ -219,17 +252,17 @@ static void reduce(const Grid *grid, const double *w, const Points *at, Reduced 
 
 /* Eliminate the multiplier, which makes the matrix positive definite exactly where the state is stable, and take it
    apart into L D L'. Returns whether it is positive definite; another matrix gets what it gets. */
-static int factor(int64_t n, Reduced *system) {
+static int factor(int64_t n, const double *coupling, double give, double *matrix, double *diagonal) {
     int positive = 1;
-    double *row = system->matrix;
+    double *row = matrix;
     for (int64_t i = 0; i < n; i++, row += i) {
-        double share = system->coupling[i] / system->give;
-        for (int64_t j = 0; j <= i; j++) row[j] += share * system->coupling[j];
-        system->diagonal[i] = row[i];
-        const double *other = system->matrix;
+        double share = coupling[i] / give;
+        for (int64_t j = 0; j <= i; j++) row[j] += share * coupling[j];
+        diagonal[i] = row[i];
+        const double *other = matrix;
         for (int64_t j = 0; j < i; j++, other += j)
             for (int64_t k = 0; k < j; k++) row[j] -= row[k] * other[k];
-        other = system->matrix;
+        other = matrix;
         for (int64_t j = 0; j < i; j++, other += j) {
             double part = row[j] / other[j];
             row[i] -= part * row[j];
@@ -241,14 +274,14 @@ static int factor(int64_t n, Reduced *system) {
 }
 
 /* Solve the factored system in place. */
-static void substitute(int64_t n, const Reduced *system, double *x) {
-    const double *row = system->matrix;
+static void substitute(int64_t n, const double *matrix, double *x) {
+    const double *row = matrix;
     for (int64_t i = 0; i < n; i++, row += i)
         for (int64_t j = 0; j < i; j++) x[i] -= row[j] * x[j];
-    row = system->matrix;
+    row = matrix;
     for (int64_t i = 0; i < n; i++, row += i) x[i] /= row[i];
     for (int64_t i = n - 1; i >= 0; i--) {
-        row = system->matrix + i * (i + 1) / 2;
+        row = matrix + i * (i + 1) / 2;
         for (int64_t j = 0; j < i; j++) x[j] -= row[j] * x[i];
     }
 }
@@ -275,9 +308,9 @@ static void newton_step(const Problem *problem, const Grid *grid, const double *
     int64_t modes = grid->table->modes;
     reduce(grid, w, at, system);
     double lam0 = (problem->height - system->reach) / system->give;
-    int positive = factor(modes, system);
+    int positive = factor(modes, system->coupling, system->give, system->matrix, system->diagonal);
     for (int64_t k = 0; k < modes; k++) step->dc[k] = -(system->residual[k] + lam0 * system->coupling[k]);
-    substitute(modes, system, step->dc);
+    substitute(modes, system->matrix, step->dc);
     step->lam = lam0 + dot(modes, system->coupling, step->dc) / system->give;
     step->stable = positive && system->positive;
     slopes(grid, system, step->dc, step->lam, 1, step->dw);
@@ -287,7 +320,7 @@ static void newton_step(const Problem *problem, const Grid *grid, const double *
 static void tangent(const Grid *grid, const Reduced *system, Step *by_height) {
     int64_t modes = grid->table->modes;
     for (int64_t k = 0; k < modes; k++) by_height->dc[k] = -(system->coupling[k] / system->give);
-    substitute(modes, system, by_height->dc);
+    substitute(modes, system->matrix, by_height->dc);
     by_height->lam = (1.0 + dot(modes, system->coupling, by_height->dc)) / system->give;
     slopes(grid, system, by_height->dc, by_height->lam, 0, by_height->dw);
 }

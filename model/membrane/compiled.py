@@ -32,7 +32,7 @@ from model.membrane.from_rest import CHECK_MODES
 from model.membrane.refinement import SPANS, first_modes, next_modes
 from model.specimen import Specimen
 
-MOST_MODES, MOST_PARAMETERS = 36, 8
+MOST_MODES, MOST_ELEMENTS, MOST_PARAMETERS = 36, 5, 8
 MOST_POINTS = MOST_MODES + ritz.MORE_POINTS
 LAWS: tuple[type[Law], ...] = (Ogden, NeoHooke, MooneyRivlin, Yeoh, Gent)  # in the order of their numbers in law.h
 SLOPES = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
@@ -50,7 +50,18 @@ class _Table(Structure):
     _fields_ = [(name, c_int64) for name in ("modes", "points", "next")] + [
         (name, POINTER(c_double))
         for name in (
-            *("xi", "weight", "values", "project", "pairs", "ends", "edge_tests"),
+            *(
+                "xi",
+                "weight",
+                "values",
+                "project",
+                "pairs",
+                "ends",
+                "end_slopes",
+                "integrate",
+                "to_modes",
+                "edge_tests",
+            ),
             *("fine", "fine_xi", "legendre", "carry", "check"),
         )
     ]
@@ -104,7 +115,7 @@ class _Answer(Structure):
     _fields_ = [
         *((name, c_double) for name in NUMBERS[:7]),
         ("lam", c_double),
-        *((name, c_int64) for name in ("status", "iterations", "modes", "mechanical", "electric")),
+        *((name, c_int64) for name in ("status", "iterations", "modes", "mechanical", "electric", "relaxed")),
         ("dforce", _Slopes),
     ]
 
@@ -112,23 +123,36 @@ class _Answer(Structure):
 class _State(Structure):
     """`State` in ritz.h."""
 
-    _fields_ = [("c", c_double * MOST_MODES), ("w", c_double * MOST_POINTS)]
+    _fields_ = [("c", c_double * (MOST_MODES + 2)), ("w", c_double * MOST_POINTS)]
+
+
+class _Kept(Structure):
+    """`Kept` in membrane.c."""
+
+    _fields_ = [
+        ("elements", c_int64),
+        ("folded", c_int64 * MOST_ELEMENTS),
+        ("breaks", c_double * (MOST_ELEMENTS + 1)),
+        ("state", _State * MOST_ELEMENTS),
+        ("natural", c_double * MOST_POINTS * MOST_ELEMENTS),
+    ]
 
 
 @lru_cache(maxsize=MOST_MODES)
 def _table(modes: int) -> tuple[_Table, list[Array]]:
     """Tables of `model.membrane.ritz` as the kernel reads them, and the arrays that must outlive them."""
     t, after = ritz.table(modes), next_modes(modes)
-    n, points = modes, t.points
-    functions = np.stack((t.values[:points, :n], t.values[points:, :n]))  # (2, Q, N)
-    pairs = t.pairs[: n * (n + 1) // 2].reshape(-1, 3, points)
+    functions = t.values.reshape(2, t.points, modes + 2)
     arrays = {
         "xi": t.xi,
         "weight": t.weight,
         "values": functions.transpose(0, 2, 1),
         "project": functions.transpose(1, 0, 2),
-        "pairs": pairs.transpose(2, 1, 0),
+        "pairs": t.pairs.reshape(-1, 3, t.points).transpose(2, 1, 0),
         "ends": t.ends,
+        "end_slopes": t.end_slopes,
+        "integrate": t.integrate,
+        "to_modes": t.to_modes,
         "edge_tests": np.array(output.edge_tests(modes)),
         "fine": output.fine_table(modes).T,
         "fine_xi": -np.cos(np.linspace(0.0, np.pi, output.FINE)),
@@ -138,7 +162,7 @@ def _table(modes: int) -> tuple[_Table, list[Array]]:
     }
     kept = {name: np.ascontiguousarray(values, dtype=np.float64) for name, values in arrays.items()}
     pointers = {name: values.ctypes.data_as(POINTER(c_double)) for name, values in kept.items()}
-    return _Table(modes=modes, points=points, next=after, **pointers), list(kept.values())
+    return _Table(modes=modes, points=t.points, next=after, **pointers), list(kept.values())
 
 
 @lru_cache(maxsize=64)
@@ -146,7 +170,7 @@ def _task(tolerance: float, relaxed: bool, sensitivities: bool, whole: bool) -> 
     """What the states of a call share; tables of every resolution when ``whole``, else of the first ones."""
     firsts = [first_modes(span, tolerance) for span in SPANS]
     task = _Task((), tuple(firsts), relaxed, sensitivities, tolerance)
-    for modes in {*firsts, CHECK_MODES}:
+    for modes in {*firsts, *(max(3, modes) for modes in firsts), CHECK_MODES}:
         level = 0
         while modes <= MOST_MODES and (whole or level < FEW_LEVELS):
             task.tables[modes] = ctypes.pointer(_table(modes)[0])
@@ -192,8 +216,7 @@ class One:
     """One solved state."""
 
     answer: Any  # _Answer
-    state: Any  # _State
-    span: float
+    kept: Any  # _Kept
 
     @property
     def lam(self) -> float:
@@ -201,10 +224,16 @@ class One:
 
     def arrays(self) -> tuple[ritz.Grid, ritz.State]:
         """The state as the rest of the model has it."""
-        modes = self.answer.modes
-        grid = ritz.Grid.lay(modes, np.array([[-self.span], [0.0]]))
-        c, w = np.array(self.state.c[:modes]), np.array(self.state.w[: modes + ritz.MORE_POINTS])
-        return grid, ritz.State(c[:, None], w[:, None, None])
+        kept, n, m = self.kept, self.answer.modes, self.kept.elements
+        grid = ritz.Grid.lay(n, np.array(kept.breaks[: m + 1])[:, None])
+        parts = [kept.state[k] for k in range(m)]
+        c = np.concatenate([part.c[:n] for part in parts] + [[part.c[n + 1] for part in parts[:-1]]])[:, None]
+        w = np.array([part.w[: n + ritz.MORE_POINTS] for part in parts]).T[:, :, None]
+        if not any(kept.folded):
+            return grid, ritz.State(c, w)
+        natural = np.array([kept.natural[k][: n + ritz.MORE_POINTS] for k in range(m)]).T[:, :, None]
+        relaxed = np.broadcast_to(np.array(kept.folded[:m], dtype=np.bool_)[:, None], w.shape)
+        return grid, ritz.State(c, w, natural, relaxed)
 
     def attributes(self, material: Material, sensitivities: bool) -> dict[str, Any]:
         """Attributes of `model.membrane.solve.Solution`."""
@@ -213,7 +242,7 @@ class One:
         values["stable"] = True
         values["field_exceeded"] = found.peak_field > (material.breakdown_field or math.inf)
         values["stretch_exceeded"] = found.max_stretch > (material.max_stretch or math.inf)
-        values["evaluations"] = Evaluations(found.mechanical, found.electric)
+        values["evaluations"] = Evaluations(found.mechanical, found.electric, found.relaxed)
         values["dforce"] = self.dforce(material) if sensitivities else None
         return values
 
@@ -234,14 +263,14 @@ def solve_one(
     solver = _solver()
     if solver is None:
         return None
-    film, answer, state = _one_film(specimen), _Answer(), _State()
+    film, answer, kept = _one_film(specimen), _Answer(), _Kept()
     for whole in (False, True):
         task = _task(tolerance, relaxed, sensitivities, whole)
         where = byref(c_double(h)), byref(c_double(voltage))
-        solver(byref(task), byref(film), 1, byref(_FIRST), 1, *where, byref(answer), byref(state))
+        solver(byref(task), byref(film), 1, byref(_FIRST), 1, *where, byref(answer), byref(kept))
         if answer.status != NEEDS_TABLE:
             break
-    return One(answer, state, math.log(specimen.ring_radius / specimen.disk_radius)) if answer.status >= 0 else None
+    return One(answer, kept) if answer.status >= 0 else None
 
 
 _one_film = lru_cache(maxsize=16)(_film)
@@ -275,8 +304,8 @@ def solve_states(
         solver(byref(task), films, len(films), data[0], len(some), *data[1:], None)
         good = found["status"] >= 0
         _place(result, specimens, which, some[good], found[good])
-        count.mechanical += int(found["mechanical"][good].sum())
-        count.electric += int(found["electric"][good].sum())
+        for name in ("mechanical", "electric", "relaxed"):
+            setattr(count, name, getattr(count, name) + int(found[name][good].sum()))
         left[some[good]] = False
         if not (found["status"] == NEEDS_TABLE).any():
             break

@@ -139,6 +139,38 @@ def test_every_law_has_the_digits_of_the_path_for_arrays(name: str) -> None:
         np.testing.assert_allclose(mine.dforce[one], slopes, rtol=1e-10, err_msg=one)
 
 
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-9])
+def test_wrinkled_films_have_the_digits_of_the_path_for_arrays(tolerance: float) -> None:
+    """Folds at the disk, at the ring, at both, all over; with the state itself and every derivative."""
+    films, h, voltage = [], [], []
+    for disk, lp, mm, volts in (
+        *((4.0, 1.0, 12.0, 1400.0), (4.0, 1.0, 4.0, 900.0), (4.0, 1.2, 10.0, 1900.0), (4.0, 1.0, 12.0, 1900.0)),
+        *((2.0, 1.0, 14.0, 1400.0), (8.0, 1.0, 14.0, 1400.0), (8.0, 1.05, 12.0, 1400.0), (4.0, 1.05, 12.0, 1600.0)),
+    ):
+        films.append(replace(FILM, disk_radius=disk * 1e-3, prestretch=lp))
+        h.append(mm * 1e-3)
+        voltage.append(volts)
+    mine, theirs = both(films, h, voltage, tolerance=tolerance, wrinkling="tension_field", sensitivities=True)
+    np.testing.assert_array_equal(mine.status, Status.WRINKLED)
+    for name in ("status", "modes", "iterations"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)
+    for name in NUMBERS:
+        np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), rtol=1e-10, atol=1e-6, err_msg=name)
+    assert mine.dforce is not None
+    assert theirs.dforce is not None
+    for name, slopes in theirs.dforce.items():
+        np.testing.assert_allclose(mine.dforce[name], slopes, rtol=1e-9, err_msg=name)
+    for film, height, volts in zip(films, h, voltage, strict=True):
+        one = solve(film, height, volts, tolerance=tolerance, wrinkling="tension_field")
+        assert isinstance(one.quick, compiled.One)
+        with no_kernel():
+            other = solve(film, height, volts, tolerance=tolerance, wrinkling="tension_field", sensitivities=True)
+        a, b = one.profile(21), other.profile(21)
+        np.testing.assert_array_equal(a.wrinkled, b.wrinkled)
+        for name in ("r", "z", "stretch_1", "stretch_2", "stress_1"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-9, atol=1e-12, err_msg=name)
+
+
 def test_order_and_company_change_no_bit() -> None:
     films, h, voltage = random_films(30, seed=5)
     found = solve_many(films, h, 0.5 * voltage)
@@ -196,7 +228,7 @@ def test_hostile_numbers_get_a_status_and_crash_nothing() -> None:
     random = np.random.default_rng(3)
     solver = compiled._solver()
     task = compiled._task(1e-8, True, True, True)
-    film, answers, state = compiled._film(FILM), (compiled._Answer * 1)(), compiled._State()
+    film, answers, state = compiled._film(FILM), (compiled._Answer * 1)(), compiled._Kept()
     taut = 0
     for _ in range(3000):
         bad = compiled._Film.from_buffer_copy(film)

@@ -71,7 +71,7 @@ def run(path: str) -> int:
         voltage = 10.0 ** random.uniform(0.0, 3.7, states)
         for values in (h, voltage):
             values[random.integers(0, states, states // 20)] = random.choice([0.0, np.nan, np.inf, 1e300, 5e-324])
-        answers, kept = np.zeros(states, dtype=np.dtype(compiled._Answer)), (compiled._State * states)()
+        answers, kept = np.zeros(states, dtype=np.dtype(compiled._Answer)), (compiled._Kept * states)()
         task = compiled._task(tolerance, bool(tolerance < 1e-6), True, True)
         pointers = [array.ctypes.data for array in (h, voltage, answers)]
         films = np.ascontiguousarray(films)
