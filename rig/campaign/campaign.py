@@ -125,6 +125,11 @@ class Campaign:
             raise ConfigError(f"{self.path}: there is no specimen {name!r}. There are: {', '.join(names)}.")
         return names.index(name) + 1
 
+    def told(self, one: SpecimenTable) -> dict[str, str]:
+        """What the log of a run of ``one`` says of its campaign; the file as seen from the log."""
+        place = {"number": str(self.number(one.name)), "of": str(len(self.specimens))}
+        return {"file": os.path.relpath(self.path, self.logs), "specimen": one.name, **place}
+
     def scene_text(self, one: SpecimenTable) -> str:
         """The scene of a specimen as TOML: the campaign's, with the specimen's own keys over it."""
         source = self.path.parent / self.table.scene

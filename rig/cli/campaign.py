@@ -124,6 +124,8 @@ def _go(
     again: tuple[str, ...],
     most: int | None,
 ) -> None:
+    from dataclasses import replace
+
     from drivers.links.link import DeviceError
     from rig.base.errors import FaultError, LimitError, NotSafe, RigError
     from rig.campaign.campaign import load_campaign
@@ -155,6 +157,7 @@ def _go(
         out = next_log(campaign, one)
         experiment, words = _experiment(campaign, one, given, resume and one.standing is Standing.INTERRUPTED)
         number = campaign.number(one.specimen.name)
+        experiment = replace(experiment, campaign=campaign.told(one.specimen))
         click.echo(f"Specimen {number} of {len(found)}: {one.specimen.name}{words}, into {out}")
         if not yes and experiment.scene.on_real_ports:
             note = f" ({one.specimen.note})" if one.specimen.note else ""

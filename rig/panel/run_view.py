@@ -26,10 +26,12 @@ from rig.log.follow import Follower, News
 from rig.log.reader import Columns
 from rig.operator.control import CONTINUE, PAUSE, STOP
 from rig.operator.live import LiveRun, live_run
+from rig.panel.queue import queue_of
 from rig.panel.series import Binned, Loop
 
 SAFE_VOLTAGE = 60.0  # V: below it an output counts as off, as in `rig.safety`
 LOOK_S = 0.05  # between two looks at the log
+QUEUE_S = 5.0  # between two looks at what is done of the campaign
 ASK_S = 0.25  # between two questions to the run
 OLD_S = 1.0  # data older than this are said to be old
 MOST_EVENTS = 100
@@ -37,7 +39,7 @@ LOOP_S = 0.1  # between two points of the force-displacement loop
 OUTLOOK_LIMIT_S = 120.0
 TOPICS = (
     *("/reference", "/phase", "/stage/sample", "/force/sample", "/displacement/sample", "/hv/sample"),
-    *("/event", "/target"),
+    *("/event", "/target", "/cycle"),
     *(f"/{name}/sample" for name in MONITORS),
 )
 # What a run says of itself, as the page has it: name, what it is of, factor.
@@ -88,6 +90,8 @@ class RunView:
         self._placed: tuple[float, float] | None = None  # time and reading of the newest displacement
         self._run: LiveRun | None = None
         self._said: dict[str, str] = {}
+        self._queue: dict[str, Any] = {}
+        self._next_queue = -math.inf
         self._error = ""
         self._closing = threading.Event()
         self._take(self._follower.read())
@@ -117,6 +121,7 @@ class RunView:
             if self._outlook is None and {"scene", "protocol"} <= self._texts.keys():
                 self._outlook = {}
                 threading.Thread(target=self._look_ahead, name="panel: outlook", daemon=True).start()
+            self._look_at_queue()
             if self._follower.ended:
                 self._run, self._said = None, {}
                 if self._outlook is not None:
@@ -129,6 +134,12 @@ class RunView:
                 self._take_said(self._said)
             except (RigError, OSError):
                 self._run, self._said = None, {}
+
+    def _look_at_queue(self) -> None:
+        told = self._metadata.get("campaign")
+        if told is not None and time.monotonic() >= self._next_queue:
+            self._next_queue = time.monotonic() + QUEUE_S
+            self._queue = queue_of(self.path, told)
 
     def _take_said(self, said: dict[str, str]) -> None:
         """What the run says that it measures now: where its log leaves most out (`rig.log.decimation`)."""
@@ -259,6 +270,9 @@ class RunView:
     def _take_target(self, new: Columns) -> None:
         self._latest["target_mm"] = _finite(float(new["displacement_m"][-1]) * 1e3)
 
+    def _take_cycle(self, new: Columns) -> None:
+        self._latest["cycle"] = float(new["cycle"][-1])
+
     _taking: ClassVar[dict[str, Callable[[RunView, Columns], None]]] = {
         "/reference": _take_reference,
         "/force/sample": _take_force,
@@ -268,6 +282,7 @@ class RunView:
         "/phase": _take_phase,
         "/event": _take_event,
         "/target": _take_target,
+        "/cycle": _take_cycle,
         **dict.fromkeys((f"/{name}/sample" for name in MONITORS), _take_monitor),
     }
 
@@ -335,6 +350,7 @@ class RunView:
                 "phases": len(self._phases),
                 "time_left_s": self._time_left(),
                 "events": list(self._events),
+                "queue": self._queue,
                 "error": self._error,
                 "traces": {name: trace.since(*known(name)) for name, trace in self._traces.items()},
                 "loop": self._loop.since(*known("loop")),

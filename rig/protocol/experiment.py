@@ -44,6 +44,7 @@ class Experiment:
     predictions: list[Prediction]
     resumed: dict[str, str] | None = None  # of which log this is the rest, for the log
     stored_zero: float | None = None  # of the force sensor, from the run that this one goes on with
+    campaign: dict[str, str] | None = None  # of which one this is a run, for the log
     served: bool = False  # the ports are those that ``dea-rig sim`` printed
 
     @property

@@ -234,5 +234,7 @@ def _attach(
     )
     if experiment.resumed is not None:
         log.metadata("resumed", experiment.resumed)
+    if experiment.campaign is not None:
+        log.metadata("campaign", experiment.campaign)
     for name, table in origin.items():
         log.metadata(name, table)

@@ -176,11 +176,14 @@ function show(news) {
     ["Field (model)", field ? digits(field.value, 3) : null, "V/µm"],
     ["Nearest limit", near ? `${Math.round(near.share * 100)} %` : null, near ? LIMITS[near.name][0] : ""],
     ["Step", phase ? `${phase.step} of ${steps()}` : null, phase ? phase.kind : ""],
+    ["Cycle", latest.cycle === undefined ? null : String(latest.cycle), ""],
+    ["Specimen", news.queue.of ? `${news.queue.done} of ${news.queue.of}` : null, "done"],
     ["Time left", news.ended ? "ended" : time(news.time_left_s), "by the plan"],
   ].filter((entry) => entry[1] !== null));
   showLimits(news.near);
   showSteps(news);
   showEvents(news.events);
+  showQueue(news.queue);
 }
 
 function steps() { return outlook ? Math.max(...outlook.steps.map((step) => step.step)) : "?"; }
@@ -233,6 +236,21 @@ function showSteps(news) {
     const row = document.createElement("li");
     row.textContent = `${step.step} ${step.kind}: ${step.label} (${time(step.duration_s)})`;
     row.className = k < now || news.ended ? "done" : k === now ? "now" : "";
+    return row;
+  }));
+  box.querySelector(".now")?.scrollIntoView({ block: "nearest" });
+}
+
+function showQueue(queue) {
+  const box = byId("queue"), key = JSON.stringify(queue);
+  byId("campaign").hidden = !queue.of;
+  if (!queue.of || box.dataset.key === key) return;
+  box.dataset.key = key;
+  byId("campaign-words").textContent = `${queue.title}: ${queue.words}`;
+  box.replaceChildren(...queue.rows.map((one) => {
+    const row = document.createElement("li");
+    row.textContent = [one.specimen, one.batch && `(${one.batch})`, one.is, one.note].filter(Boolean).join(" ");
+    row.className = { done: "done", running: "now", failed: "error", interrupted: "warning" }[one.is] || "";
     return row;
   }));
   box.querySelector(".now")?.scrollIntoView({ block: "nearest" });
