@@ -68,3 +68,42 @@ bus.shutdown()
 print(json.dumps(answer is None))
 """
     assert served.client(script, served.server.ports["hv"]["can_channel"]) is True
+
+
+TABLE = """
+import json, os, sys
+from isegcan.can_edcp import Resource
+from isegcan._edcp_definitions import c_cmd
+
+supply = Resource(3, channel=sys.argv[1], interface="slcan", bitrate=int(sys.argv[2]))
+asked = sys.argv[3].split()
+out = {name: getattr(supply, "query_" + name)(None, 0) for name in asked}
+# Its setters wait for an answer, which writes do not have.
+for name, value in (("power_set", 1.5), ("resistor_external", 1e6), ("voltage_ramp_priority", 1), ("power_set", 1e9)):
+    supply._command(c_cmd["channel_" + name], value, 0, is_write=True)  # the last one is beyond what it has: refused
+out["power then"] = supply.query_channel_power_set(None, 0)
+out["resistor then"] = supply.query_channel_resistor_external(None, 0)
+out["priority then"] = supply.query_channel_voltage_ramp_priority(None, 0)
+print()
+print(json.dumps(out), flush=True)
+os._exit(0)
+"""
+ITEMS = {
+    "channel_voltage_ramp_priority": 0,
+    "channel_nominal_power": 6.0,
+    "channel_voltage_bottom": 0.0,
+    "channel_vct_coefficient": 0.0,
+    "channel_temperature_external": 25.0,
+    "channel_resistor_external": 0.0,
+    "channel_current_ramp_speed_min": 0.0,
+    "channel_current_ramp_speed_max": 2e-4,
+    "channel_power_set": 6.0,
+    "module_event_group_mask": 0,
+}
+
+
+def test_items_beside_the_voltage_are_there_and_keep_what_is_written(serve):
+    served = serve("hv", hv={"module": 3})
+    out = served.client(TABLE, served.server.ports["hv"]["can_channel"], "125000", " ".join(ITEMS))
+    assert {name: out[name] for name in ITEMS} == pytest.approx(ITEMS, rel=1e-6)
+    assert (out["power then"], out["resistor then"], out["priority then"]) == (1.5, 1e6, 1)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from rig.sim.instruments.iseg.module import IsegEDCP, IsegTruth
+from rig.sim.instruments.iseg.module import IsegEDCP
+from rig.sim.instruments.iseg.truth import IsegTruth
 from rig.sim.twin import Twin
 
 __all__ = ["TWINS", "IsegEDCP", "IsegTruth"]

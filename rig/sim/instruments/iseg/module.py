@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Literal
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
+from rig.sim.instruments.iseg import more
+from rig.sim.instruments.iseg.truth import IsegTruth
 from rig.sim.instruments.iseg.words import (
     ARC,
     BLOCKING,
@@ -55,7 +56,7 @@ from rig.sim.instruments.iseg.words import (
 )
 from rig.sim.noise import ConversionNoise
 from rig.sim.supply import switch_output
-from rig.sim.truth import IN_REACH, ONE_PIECE, BusTruth, Fault, NotNegative, OutputTruth, Positive
+from rig.sim.truth import Fault
 from rig.sim.wire import Frame, FrameWire
 from rig.sim.world import TICK, World
 
@@ -63,32 +64,6 @@ ANSWER_S = 0.5e-3
 ADC_S = 0.02
 QUIET_S = 60.0
 MODULE_CLASS = 0x14  # type byte of the log-on frame
-
-
-class IsegTruth(OutputTruth, BusTruth):
-    """iseg EDCP module on CAN; the film is on its first channel."""
-
-    means_nothing: ClassVar[Mapping[str, str]] = ONE_PIECE | IN_REACH
-    more_faults: ClassVar[tuple[str, ...]] = (*OutputTruth.more_faults, "interlock", "inhibit")
-
-    driver: Literal["iseg-edcp"] = Field(default="iseg-edcp", description="iseg supply on CAN.")
-    serial_number: int = Field(default=484_216, description="Serial number that it states.")
-    module: int = Field(default=0, ge=0, le=63, description="Its module number.")
-    channels: int = Field(default=1, ge=1, le=16, description="How many channels it has.")
-    bitrate: Literal[125_000, 250_000] = Field(default=125_000, description="Of the bus (bit/s).")
-    nominal_voltage_V: Positive = Field(default=6000.0, description="Nominal voltage of a channel (V).")
-    nominal_current_mA: Positive = Field(default=1.0, description="Nominal current of a channel (mA).")
-    ramp_percent_per_s: Positive = Field(default=10.0, description="Voltage ramp at power-up (% of nominal per s).")
-    max_ramp_percent_per_s: Positive = Field(default=20.0, description="Fastest voltage ramp (% of nominal per s).")
-    voltage_noise_V: NotNegative = Field(default=0.3, description="Standard deviation of a voltage reading (V).")
-    current_noise_nA: NotNegative = Field(default=5.0, description="Standard deviation of a current reading (nA).")
-    voltage_limit_percent: Positive = Field(default=100.0, description="Hardware voltage limit (% of nominal).")
-    current_limit_percent: Positive = Field(default=100.0, description="Hardware current limit (% of nominal).")
-    limit_good_bit: bool = Field(
-        default=False, description="Whether bit 5 of its status says that the hardware limit is good; most say nothing."
-    )
-    negative: bool = Field(default=False, description="Whether its channels give negative voltages.")
-    logon_period_s: Positive = Field(default=5.0, description="How often it announces itself, not registered (s).")
 
 
 class IsegEDCP:
@@ -114,6 +89,7 @@ class IsegEDCP:
         self.nominal_v = settings.nominal_voltage_V
         self._sign = -1.0 if settings.negative else 1.0
         self.nominal_i = settings.nominal_current_mA * 1e-3
+        self._rated = more.Rated(self.nominal_v, self.nominal_i, settings.channels)
         self.stuck_on = self.lies = False
         self.sag = 1.0
         self.wrong_status = 0
@@ -145,6 +121,7 @@ class IsegEDCP:
         self._input_error = False
         self._event = 0
         self._event_mask = 0
+        self._group_mask = 0
         self._registered = False
         self._addressed = t
         self._next_logon = t + 0.1
@@ -438,6 +415,7 @@ class IsegEDCP:
             0x1003: (">H", self._event_mask),
             0x1004: (">H", sum(1 << i for i, c in enumerate(self._channels) if c.event & c.mask)),
             0x1005: (">I", 0),
+            more.GROUP_MASK: (">I", self._group_mask),
             0x1100: (">f", self._ramp_percent),
             **{code: (">f", at) for code, at in ((0x1101, 100.0), (0x1104, 24.1), (0x1105, 5.02), (0x1106, 31.0))},
             0x1200: (">I", s.serial_number),
@@ -472,7 +450,10 @@ class IsegEDCP:
             0x4127: (">f", 0.0),
             0x4128: (">f", self._settings.max_ramp_percent_per_s / 100 * self.nominal_v),
         }
-        return struct.pack(*values[opcode]) if opcode in values else None
+        if opcode in values:
+            return struct.pack(*values[opcode])
+        volts, amperes = (self._measured_v(t), self._measured_i(t)) if first else (0.0, 0.0)
+        return more.read(opcode, channel, self._rated, volts, amperes)
 
     # Writing
 
@@ -501,6 +482,9 @@ class IsegEDCP:
                     self._event |= SAFETY_LOOP
             else:
                 self._event_mask = word
+            return True
+        if opcode == more.GROUP_MASK and len(value) == 4:
+            (self._group_mask,) = struct.unpack(">I", value)
             return True
         if opcode == 0x1100 and len(value) == 4:
             (percent,) = struct.unpack(">f", value)
@@ -551,7 +535,7 @@ class IsegEDCP:
             if opcode == 0x4100:  # either sign means the channel's own
                 number = abs(number)
             return self._write_quantity(opcode, channel, number, t)
-        return False
+        return more.write(opcode, channel, value, self._rated)
 
     def _write_quantity(self, opcode: int, channel: Channel, number: float, t: float) -> bool:
         v_top = self.nominal_v * self._settings.voltage_limit_percent / 100

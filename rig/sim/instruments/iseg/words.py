@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 # Module status
 KILL, TEMPERATURE, SUPPLY, MODULE_GOOD, EVENT_ACTIVE, SAFETY_LOOP = 1 << 15, 1 << 14, 1 << 13, 1 << 12, 1 << 11, 1 << 10
@@ -41,3 +41,4 @@ class Channel:
     over_since: float = math.inf
     ramping: bool = False
     limiting: bool = False
+    more: dict[int, float] = field(default_factory=dict)  # of `rig.sim.instruments.iseg.more`
