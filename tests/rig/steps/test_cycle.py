@@ -6,25 +6,31 @@ from __future__ import annotations
 import math
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from rig.base.errors import LimitError
+from rig.engine.engine import Engine
 from rig.log.decimation import Decimation
 from rig.log.reader import Log, read_log
 from rig.log.schema import encode
-from rig.protocol.experiment import Experiment, prepare
+from rig.log.writer import LogWriter
+from rig.operator.control import Control
+from rig.operator.status import Status
+from rig.protocol.experiment import Experiment, gains_of, prepare
 from rig.protocol.plan import plan
 from rig.protocol.protocol import Protocol
 from rig.replay.recording import load_recording
 from rig.replay.verify import verify
+from rig.run.backend import open_bench
 from rig.run.rehearse import log_size
 from rig.run.resume import prepare_resumed
 from rig.run.run import run
 from rig.scene.scene import load_scene
-from rig.steps.cycle import Ends, Slope
+from rig.steps.cycle import Cycle, Drift, Ends, Slope
 from tests.protocols import TO_THE_FILM
 from tests.rig.steps.test_keys_of_steps import BEFORE, SCENES
 
@@ -62,6 +68,7 @@ def results(log: Log) -> dict[str, float]:
     return {m.fields["name"]: m.fields["value"] for m in log.messages("/result")}
 
 
+BREAKS = '[[simulation.fault]]\nrole = "hv"\nkind = "breakdown"\nat_s = 23\n'
 DISPLACEMENT = "from_mm = 1\nto_mm = 4\nperiod_s = 1.6\n"
 
 
@@ -227,3 +234,84 @@ def test_slopes_and_ends_of_one_pass_are_those_of_all_samples() -> None:
     slope.add(math.nan, 1.0)
     ends.add(math.nan)
     assert math.isfinite(slope.slope) and ends.count == 500
+
+
+@pytest.mark.slow
+def test_a_pause_is_told_heals_nothing_and_the_count_goes_on(tmp_path: Path) -> None:
+    """What the stage did is one way more than whole cycles: told as a cycle that is not whole, and done again."""
+    experiment = prepare(*cycling(tmp_path, DISPLACEMENT + "cycles = 7\n"))
+    bench = open_bench(experiment.scene)
+    control = Control(unattended="a test")
+    begun: list[float] = []
+
+    def show(status: Status) -> None:
+        now = bench.clock.now()
+        if "cycles of" in status.label and not begun:
+            begun.append(now)
+        if begun and begun[0] + 5.0 <= now < begun[0] + 5.5:
+            control.ask_pause("a test")
+        elif begun and now > begun[0] + 8.0:
+            control.pausing = ""
+
+    with LogWriter(tmp_path / "log.mcap") as writer:
+        engine = Engine(
+            bench, experiment.actions, writer, gains_of(experiment.certificates), control, lambda *_: None,
+            experiment.certificates, show=show,
+        )  # fmt: skip
+        outcome, error = engine.run()
+        writer.finish(outcome.as_text())
+    assert error is None and outcome.safe, outcome.reason
+    rows = summaries(read_log(tmp_path / "log.mcap"))
+    assert [(row["cycle"], row["whole"]) for row in rows if row["cycle"] in (4, 5)][:2] == [(4, False), (4, True)]
+    assert [row["cycle"] for row in rows if row["whole"]] == [1, 2, 3, 4, 5, 6, 7]
+    again = next(row for row in rows if row["cycle"] == 4 and row["whole"])
+    assert again["begin_s"] > begun[0] + 8.0
+    acts = [message.fields["act"] for message in read_log(tmp_path / "log.mcap").messages("/operator")]
+    assert [act for act in acts if act in ("pauses", "continues")] == ["pauses", "continues"]
+
+
+@pytest.mark.slow
+def test_a_breakdown_is_a_result_and_the_output_is_off(tmp_path: Path) -> None:
+    scene, protocol = cycling(
+        tmp_path,
+        'waveform = "square"\nfrom_V = 100\nto_V = 500\nperiod_s = 6\ncycles = 20\n',
+        replace={
+            "[simulation.hv]": '[[simulation.fault]]\nrole = "hv"\nkind = "breakdown"\nat_s = 23\n[simulation.hv]'
+        },
+    )
+    log = carried_out(prepare(scene, protocol), tmp_path / "log.mcap")
+    outcome = log.outcome or {}
+    assert outcome["status"] == "complete" and outcome["safe"] == "yes"
+    found = {m.fields["outcome"] for m in log.messages("/result")}
+    counted = [row["cycle"] for row in summaries(log) if row["whole"]]
+    assert found == {"breakdown"} and results(log)["cycles"] == len(counted) == counted[-1]
+    volts = log.columns("/hv/sample")
+    assert volts["voltage_V"].max() > 490 and volts["voltage_V"][-1] < 60
+    for row in summaries(log)[:-1]:
+        assert row["voltage_peak_V"] == pytest.approx(500, abs=3) and row["leakage_A"] == pytest.approx(25e-9, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("keys", "slopes", "leak", "why", "at"),
+    [
+        ({"stop_below_percent": 80}, lambda n: 10.0 - 0.1 * n, 0.0, "drift", 32),
+        ({"stop_above_percent": 120}, lambda n: 10.0 + 0.1 * n, 0.0, "drift", 37),
+        ({"stop_leakage_nA": 50.0, "waveform": "square"}, lambda n: 10.0, 2.05e-9, "leakage", 27),
+        ({}, lambda n: 10.0 - 0.1 * n, 2e-9, "", 60),
+    ],
+)
+def test_what_ends_it_is_what_changed_against_the_reference(
+    keys: dict[str, Any], slopes: Any, leak: float, why: str, at: int
+) -> None:
+    """The reference is the mean of cycles 10 to 14, what is judged that of the last five: two cycles behind."""
+    step = Cycle.model_validate({"do": "cycle", "to_mm": 4.0, "period_s": 10.0, "cycles": 60, **keys})
+    drift, references = Drift(step, math.nan), []
+    recorder = SimpleNamespace(reference=lambda *words: references.append(words))
+    rig: Any = SimpleNamespace(recorder=recorder)
+    for n in range(1, 61):
+        row = {"cycle": n, "stiffness_N_per_m": slopes(n), "actuation_N_per_V2": math.nan, "leakage_A": leak * n}
+        if said := drift.judge(rig, row):
+            break
+    assert (said, n) == (why, at)
+    assert [(name, unit) for name, _, _, unit in references] == [("cycle_response", "N/m")]
+    assert drift.reference == pytest.approx(np.mean([slopes(n) for n in range(10, 15)]))
