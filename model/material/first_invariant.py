@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from math import expm1
-
 import numpy as np
 
 from model.arrays import Array
@@ -24,23 +22,3 @@ def derivatives(squares: Array, first: Array, second: Array | float) -> Derivati
     h11 = first * (4.0 * (squares[0] + 1.0) + through) + second * by1 * by1
     h22 = first * (4.0 * (squares[1] + 1.0) + through) + second * by2 * by2
     return first * by1, first * by2, h11, first * through + second * by1 * by2, h22
-
-
-def invariant_at(log1: float, log2: float) -> tuple[float, float, float, float]:
-    """``J`` and the three ``l_i^2 - 1`` at one point."""
-    x, y, z = expm1(2.0 * log1), expm1(2.0 * log2), expm1(-2.0 * (log1 + log2))
-    return x + y + z, x, y, z
-
-
-def derivatives_at(
-    x: float, y: float, z: float, first: float, second: float
-) -> tuple[float, float, float, float, float]:
-    """`derivatives` at one point."""
-    by1, by2, through = 2.0 * (x - z), 2.0 * (y - z), 4.0 * (z + 1.0)
-    return (
-        first * by1,
-        first * by2,
-        first * (4.0 * (x + 1.0) + through) + second * by1 * by1,
-        first * through + second * by1 * by2,
-        first * (4.0 * (y + 1.0) + through) + second * by2 * by2,
-    )

@@ -7,13 +7,12 @@ film. For ``J_m`` towards infinity it is the neo-Hookean law.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import nan
 
 import numpy as np
 
 from model.arrays import Array
-from model.material.first_invariant import derivatives, derivatives_at, invariant, invariant_at
-from model.material.law import Derivatives, Law, Parameter, Point
+from model.material.first_invariant import derivatives, invariant
+from model.material.law import Derivatives, Law, Parameter
 
 
 class Gent(Law):
@@ -57,19 +56,6 @@ class Gent(Law):
         rise = 2.0 * (squares[:2] - squares[2])
         by_mu = 0.5 * inverse * rise
         return by_mu[None], (-self.mu[0] * inverse * share / self.alpha[0] * by_mu)[None]
-
-    @classmethod
-    def point(cls, mu: Sequence[float], alpha: Sequence[float]) -> Point:
-        half, limit = 0.5 * mu[0], alpha[0]
-
-        def at(log1: float, log2: float) -> tuple[float, float, float, float, float]:
-            total, x, y, z = invariant_at(log1, log2)
-            if not total < limit:
-                return nan, nan, nan, nan, nan
-            first = half / (1.0 - total / limit)
-            return derivatives_at(x, y, z, first, first / (limit - total))
-
-        return at
 
     @classmethod
     def shear_modulus(cls, mu: Sequence[float], alpha: Sequence[float]) -> float:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from model.arrays import Array
 
 Derivatives = tuple[Array, Array, Array, Array, Array]  # dW/dL1, dW/dL2, d2W/dL1^2, d2W/dL1 dL2, d2W/dL2^2
-Point = Callable[[float, float], tuple[float, float, float, float, float]]  # the same at one point, from L1 and L2
 
 
 @dataclass(frozen=True)
@@ -100,17 +99,6 @@ class Law(ABC):
 
         Five new arrays (..., S) that share no memory: the caller writes into them.
         """
-
-    @classmethod
-    def point(cls, mu: Sequence[float], alpha: Sequence[float]) -> Point:
-        """`derivatives` at one point in plain numbers, for the solver of single states; a law may write it out."""
-        law = cls(np.array(mu, dtype=float)[:, None], np.array(alpha, dtype=float)[:, None])
-
-        def at(log1: float, log2: float) -> tuple[float, float, float, float, float]:
-            t1, t2, h11, h12, h22 = law.derivatives(np.array([[log1], [log2], [-(log1 + log2)]]))
-            return float(t1[0]), float(t2[0]), float(h11[0]), float(h12[0]), float(h22[0])
-
-        return at
 
     def by_parameters(self, log: Array) -> tuple[Array, Array]:
         """Derivatives of ``dW/dL1`` and ``dW/dL2`` by every modulus and shape parameter: (moduli, 2, ..., S) and

@@ -3,12 +3,11 @@ r"""The Mooney-Rivlin law, :math:`W = C_1 (I_1 - 3) + C_2 (I_2 - 3)` (Rivlin & S
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import expm1
 
 import numpy as np
 
 from model.arrays import Array
-from model.material.law import Derivatives, Law, Parameter, Point
+from model.material.law import Derivatives, Law, Parameter
 
 
 class MooneyRivlin(Law):
@@ -41,20 +40,6 @@ class MooneyRivlin(Law):
             modulus[2],
             modulus[1] + modulus[2],
         )
-
-    @classmethod
-    def point(cls, mu: Sequence[float], alpha: Sequence[float]) -> Point:
-        c1, c2 = 2.0 * mu[0], 2.0 * mu[1]
-
-        def one(log: float) -> tuple[float, float]:
-            square, inverse = expm1(2.0 * log), expm1(-2.0 * log)
-            return c1 * square - c2 * inverse, 2.0 * (c1 * (square + 1.0) + c2 * (inverse + 1.0))
-
-        def at(log1: float, log2: float) -> tuple[float, float, float, float, float]:
-            (s1, m1), (s2, m2), (s3, m3) = one(log1), one(log2), one(-(log1 + log2))
-            return s1 - s3, s2 - s3, m1 + m3, m3, m2 + m3
-
-        return at
 
     @classmethod
     def shear_modulus(cls, mu: Sequence[float], alpha: Sequence[float]) -> float:

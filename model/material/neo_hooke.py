@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import Array
-from model.material.first_invariant import derivatives, derivatives_at, invariant, invariant_at
-from model.material.law import Derivatives, Law, Parameter, Point
+from model.material.first_invariant import derivatives, invariant
+from model.material.law import Derivatives, Law, Parameter
 
 
 class NeoHooke(Law):
@@ -26,16 +26,6 @@ class NeoHooke(Law):
     def derivatives(self, log: Array) -> Derivatives:
         total, squares = invariant(log)
         return derivatives(squares, np.broadcast_to(0.5 * self.mu[0], total.shape), 0.0)
-
-    @classmethod
-    def point(cls, mu: Sequence[float], alpha: Sequence[float]) -> Point:
-        half = 0.5 * mu[0]
-
-        def at(log1: float, log2: float) -> tuple[float, float, float, float, float]:
-            _, x, y, z = invariant_at(log1, log2)
-            return derivatives_at(x, y, z, half, 0.0)
-
-        return at
 
     @classmethod
     def shear_modulus(cls, mu: Sequence[float], alpha: Sequence[float]) -> float:

@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from math import expm1
 
 import numpy as np
 
 from model.arrays import Array
-from model.material.law import Derivatives, Law, Parameter, Point
+from model.material.law import Derivatives, Law, Parameter
 
 LEAST_EXPONENT = 1e-6  # in size: at zero the energy of a term has no meaning
 
@@ -87,56 +86,6 @@ class Ogden(Law):
                 a += term
         a += self._twice_shear
         return m[0] - m[2], m[1] - m[2], a[0] + a[2], a[2], a[1] + a[2]
-
-    @classmethod
-    def point(cls, mu: Sequence[float], alpha: Sequence[float]) -> Point:
-        if len(mu) == 1:
-            (mu1,), (alpha1,) = mu, alpha
-            base = own1 = mu1 * alpha1
-
-            def one(log1: float, log2: float) -> tuple[float, float, float, float, float]:
-                x, y, z = expm1(alpha1 * log1), expm1(alpha1 * log2), expm1(-alpha1 * (log1 + log2))
-                h12 = base + own1 * z
-                return mu1 * (x - z), mu1 * (y - z), base + own1 * x + h12, h12, base + own1 * y + h12
-
-            return one
-        if len(mu) == 2:
-            (m1, m2), (a1, a2) = mu, alpha
-            p1, p2 = m1 * a1, m2 * a2
-            base = p1 + p2
-
-            def two(log1: float, log2: float) -> tuple[float, float, float, float, float]:
-                log3 = -(log1 + log2)
-                x, y, z = expm1(a1 * log1), expm1(a1 * log2), expm1(a1 * log3)
-                u, v, w = expm1(a2 * log1), expm1(a2 * log2), expm1(a2 * log3)
-                h12 = base + p1 * z + p2 * w
-                return (
-                    m1 * (x - z) + m2 * (u - w),
-                    m1 * (y - z) + m2 * (v - w),
-                    base + p1 * x + p2 * u + h12,
-                    h12,
-                    base + p1 * y + p2 * v + h12,
-                )
-
-            return two
-        terms = tuple((m, a, m * a) for m, a in zip(mu, alpha, strict=True))
-        base = math.fsum(product for _, _, product in terms)
-
-        def many(log1: float, log2: float) -> tuple[float, float, float, float, float]:
-            log3 = -(log1 + log2)
-            t1 = t2 = 0.0
-            h11 = h22 = 2.0 * base
-            h12 = base
-            for modulus, exponent, product in terms:
-                x, y, z = expm1(exponent * log1), expm1(exponent * log2), expm1(exponent * log3)
-                t1 += modulus * (x - z)
-                t2 += modulus * (y - z)
-                h11 += product * (x + z)
-                h22 += product * (y + z)
-                h12 += product * z
-            return t1, t2, h11, h12, h22
-
-        return many
 
     def by_parameters(self, log: Array) -> tuple[Array, Array]:
         powers = self._powers(log)

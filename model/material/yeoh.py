@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import Array
-from model.material.first_invariant import derivatives, derivatives_at, invariant, invariant_at
-from model.material.law import Derivatives, Law, Parameter, Point
+from model.material.first_invariant import derivatives, invariant
+from model.material.law import Derivatives, Law, Parameter
 
 
 class Yeoh(Law):
@@ -48,16 +48,6 @@ class Yeoh(Law):
         c1, c2, c3 = self.mu
         total, squares = invariant(log)
         return derivatives(squares, c1 + total * (2.0 * c2 + total * (3.0 * c3)), 2.0 * c2 + total * (6.0 * c3))
-
-    @classmethod
-    def point(cls, mu: Sequence[float], alpha: Sequence[float]) -> Point:
-        c1, c2, c3 = mu[0], 2.0 * mu[1], 3.0 * mu[2]
-
-        def at(log1: float, log2: float) -> tuple[float, float, float, float, float]:
-            total, x, y, z = invariant_at(log1, log2)
-            return derivatives_at(x, y, z, c1 + total * (c2 + total * c3), c2 + 2.0 * total * c3)
-
-        return at
 
     @classmethod
     def shear_modulus(cls, mu: Sequence[float], alpha: Sequence[float]) -> float:

@@ -13,13 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import Array
 from model.material.law import Evaluations, Film, stack, stress
 from model.material.materials import EPSILON_0
-from model.membrane import compiled, from_rest, ritz, scalar, tension_field
+from model.membrane import compiled, from_rest, ritz, tension_field
 from model.membrane.flat import Flat, Solved
 from model.membrane.profile import Profile, dense, profile
 from model.membrane.refinement import ROUND_OFF_TENSION, Answer, Start, groups, prolonged, refine
 from model.membrane.ritz import LONGEST, Grid, Problem
-from model.membrane.scalar_state import Film as OneFilm
-from model.membrane.scalar_state import Found, slack
 from model.membrane.solution import Solutions, Status
 from model.specimen import Specimen
 
@@ -56,7 +54,7 @@ class Solution:
     dforce: dict[str, Any] | None = None
     evaluations: Evaluations = field(default_factory=Evaluations, compare=False)
     kept: Solved | None = field(default=None, repr=False, compare=False)
-    quick: Found | compiled.One | None = field(default=None, repr=False, compare=False)
+    quick: compiled.One | None = field(default=None, repr=False, compare=False)
 
     @property
     def answered(self) -> bool:
@@ -234,56 +232,6 @@ def _check(tolerance: float, wrinkling: str) -> None:
         raise ValueError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
 
 
-def _quick(
-    specimen: Specimen, h: float, voltage: float, tolerance: float, folds: bool, near: Found | None
-) -> Solution | None:
-    """An easy state, solved without arrays; None when it is not one."""
-    m, t, b, lp = specimen.material, specimen.thickness, specimen.ring_radius, specimen.prestretch
-    if h == 0.0 or not (math.isfinite(h) and math.isfinite(voltage)) or tolerance < 1e-11:
-        return None
-    shear = m.shear_modulus
-    film = OneFilm(
-        law=m.law.point([mu / shear for mu in m.mu], m.alpha),
-        field=m.permittivity * (voltage / t) ** 2 / shear,
-        log_prestretch=math.log(lp),
-        span=math.log(b / specimen.disk_radius),
-        height=abs(h) / b,
-    )
-    count = Evaluations()
-    found = None if near is None else scalar.solve(film, tolerance, count, folds=folds, near=near)
-    if found is None:
-        found = scalar.solve(film, tolerance, count, folds=folds)
-    if found is None or found.meridional <= 0.0:
-        return None
-    if found.softening > SOFTENING and not _on_branch(specimen, h, voltage, found, count):
-        return None
-    wrinkled = bool(found.cones) or found.hoop < ROUND_OFF_TENSION * found.meridional
-    if wrinkled and slack(film):
-        return None
-    force = 2.0 * math.pi * b * t * shear / lp**2 * found.lam
-    peak, stretch = abs(voltage) / t * math.exp(found.log_area), math.exp(found.log_stretch)
-    return Solution(
-        specimen=specimen,
-        h=h,
-        voltage=voltage,
-        force=math.copysign(force, h),
-        peak_field=peak,
-        peak_field_radius=b * found.radius,
-        min_hoop_stress=shear * found.hoop,
-        min_meridional_stress=shear * found.meridional,
-        max_stretch=stretch,
-        status=Status.WRINKLED if wrinkled else Status.TAUT,
-        error_estimate=found.error,
-        iterations=found.steps,
-        modes=found.modes,
-        stable=True,
-        field_exceeded=m.breakdown_field is not None and peak > m.breakdown_field,
-        stretch_exceeded=m.max_stretch is not None and stretch > m.max_stretch,
-        evaluations=count,
-        quick=found,
-    )
-
-
 _STATUSES = tuple(Status)
 
 
@@ -294,16 +242,6 @@ def _compiled(specimen: Specimen, h: float, voltage: float, one: compiled.One, s
     solution.__dict__.update(one.attributes(specimen.material, sensitivities), quick=one, kept=None)
     solution.__dict__.update(specimen=specimen, h=h, voltage=voltage, status=status)
     return solution
-
-
-def _on_branch(specimen: Specimen, h: float, voltage: float, found: Found, count: Evaluations) -> bool:
-    """Whether an easy taut state is plainly on the branch from rest; see `_Block.doubtful`."""
-    if found.cones:
-        return False
-    with np.errstate(all="ignore"):
-        problem = _Block(_Inputs.gather(specimen, h, voltage), np.zeros(1, dtype=np.intp), count).problem
-        end = prolonged(Start(*found.arrays()), from_rest.CHECK_MODES)
-        return bool(from_rest.connected(problem, end, np.array([found.lam]))[0])
 
 
 def _solve(
@@ -338,12 +276,8 @@ def solve(
     tolerance: float = 1e-8,
     wrinkling: Wrinkling = "plain",
     sensitivities: bool = False,
-    near: Solution | None = None,
 ) -> Solution:
-    """Solve one state: `solve_many` for scalars, with the profiles at hand.
-
-    ``near``, the solution of a like state, shortens the way to a taut one; the answer does not depend on it.
-    """
+    """Solve one state: `solve_many` for scalars, with the profiles at hand."""
     _check(tolerance, wrinkling)
     folds = wrinkling == "tension_field"
     one = compiled.solve_one(
@@ -351,11 +285,6 @@ def solve(
     )
     if one is not None:
         return _compiled(specimen, float(h), float(voltage), one, sensitivities)
-    if not sensitivities:
-        begin = near.quick if near is not None and isinstance(near.quick, Found) else None
-        quick = _quick(specimen, float(h), float(voltage), tolerance, folds, begin)
-        if quick is not None:
-            return quick
     inputs = _Inputs.gather(specimen, float(h), float(voltage))
     many, kept = _solve(inputs, tolerance, wrinkling, sensitivities, keep=True)
     return Solution(

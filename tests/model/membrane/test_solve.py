@@ -12,7 +12,6 @@ import pytest
 import scipy.constants
 
 from model.material.materials import EPSILON_0, NAMED, Material
-from model.membrane import compiled
 from model.membrane.solve import Status, Wrinkling, solve, solve_many
 from model.specimen import Specimen
 from model.verification.reference import reference
@@ -296,43 +295,6 @@ def test_profile_obeys_the_equations(specimen: Specimen, h: float, v: float, wri
 def test_no_profile_without_an_answer() -> None:
     with pytest.raises(ValueError, match="slack"):
         solve(film(4, 1.0), 1e-3, 2500.0).profile()
-
-
-@pytest.fixture
-def no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, "_solver", lambda: None)
-
-
-@pytest.mark.usefixtures("no_kernel")
-def test_the_path_for_one_state_has_the_digits_of_the_path_for_many() -> None:
-    """A single taut state is solved without arrays, by the same steps: every result must be the same."""
-    films = [film(a, lp) for a in (1.0, 4.0, 12.0) for lp in (1.0, 1.3)] + [film(6.0, 1.5, NAMED["treloar-ogden1972"])]
-    names = ("force", "peak_field", "peak_field_radius", "min_hoop_stress", "min_meridional_stress", "max_stretch")
-    compared = 0
-    for specimen in films:
-        for h, v in ((1e-3, 0.0), (8e-3, 0.0), (-8e-3, 400.0), (30e-3, 600.0)):
-            for tolerance in (1e-5, 1e-8, 1e-10):
-                one = solve(specimen, h, v, tolerance=tolerance)
-                many = solve_many(specimen, [h], v, tolerance=tolerance)
-                assert one.status == many.status[0]
-                if one.quick is None:
-                    continue
-                compared += 1
-                assert (one.iterations, one.modes) == (many.iterations[0], many.modes[0])
-                assert one.error_estimate == pytest.approx(many.error_estimate[0], rel=1e-3)
-                for name in names:
-                    assert getattr(one, name) == pytest.approx(getattr(many, name)[0], rel=1e-9, abs=1e-6), name
-    assert compared > 60
-
-
-@pytest.mark.usefixtures("no_kernel")
-def test_a_solution_nearby_shortens_the_way_and_changes_no_answer() -> None:
-    near = solve(film(), 9.9e-3, 1480.0)
-    cold, warm = solve(film(), 10e-3, 1500.0), solve(film(), 10e-3, 1500.0, near=near)
-    assert warm.iterations < cold.iterations
-    assert warm.force == pytest.approx(cold.force, rel=1e-8)
-    other = solve(film(8, 1.0), 10e-3, near=near)
-    assert other.force == pytest.approx(solve(film(8, 1.0), 10e-3).force, rel=1e-8)
 
 
 def test_the_least_hoop_stress_inside_the_film_converges_with_the_tolerance() -> None:

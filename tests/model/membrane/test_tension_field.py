@@ -60,16 +60,12 @@ def test_independent_formulation(lp: float, h: float, voltage: np.ndarray) -> No
 FOLDS = [(1.0, 12e-3, 1400.0, 2), (1.0, 4e-3, 900.0, 1), (1.2, 10e-3, 1900.0, 1), (1.0, 12e-3, 1900.0, 0)]
 
 
-@pytest.fixture
-def no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, "_solver", lambda: None)
-
-
-@pytest.mark.usefixtures("no_kernel")
 @pytest.mark.parametrize(("lp", "h", "v", "cuts"), FOLDS)
-def test_the_path_for_one_state_finds_what_the_path_for_many_does(lp: float, h: float, v: float, cuts: int) -> None:
+def test_the_kernel_finds_what_the_path_for_arrays_does(
+    lp: float, h: float, v: float, cuts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one = solve(film(lp), h, v, tolerance=1e-9, wrinkling="tension_field")
-    assert one.quick is not None
+    monkeypatch.setattr(compiled, "_solver", lambda: None)
     many = solve_many(film(lp), [h], v, tolerance=1e-9, wrinkling="tension_field")
     assert one.status == many.status[0] == Status.WRINKLED
     assert one.force == pytest.approx(many.force[0], rel=2e-9)
