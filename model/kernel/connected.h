@@ -5,14 +5,21 @@
 
 #include "output.h"
 
-enum { CHECK_MODES = 6, CHECK_POINTS = CHECK_MODES + 3, WAY_STEPS = 8, BETWEEN = 4 };
-enum { STATIONS = BETWEEN * (CHECK_POINTS + 1) + 1 };
+enum {
+    CHECK_MODES = 6,
+    CHECK_POINTS = CHECK_MODES + 3,
+    WAY_STEPS = 8,
+    BETWEEN = 4
+};
+enum {
+    STATIONS = BETWEEN * (CHECK_POINTS + 1) + 1
+};
 #define WAY_GOAL 3e-2
 #define CORRECTION 0.3
 #define SAFE 0.96
 
-/* Whether the energy is convex from the taut film with r = R to this state, at every point: whether one multiple of e q,
-   whose integral over a clamped film is zero, makes every point convex. */
+/* Whether the energy is convex from the taut film with r = R to this state, at every point: whether one multiple of e
+   q, whose integral over a clamped film is zero, makes every point convex. */
 static int between(Problem *problem, const Grid *grid, const State *state) {
     double e1[MOST_POINTS], q1[MOST_POINTS], low = -INFINITY, high = INFINITY;
     strain(grid, state->c, e1, q1);
@@ -21,8 +28,8 @@ static int between(Problem *problem, const Grid *grid, const State *state) {
             double share = 0.5 * (double)k, e = share * e1[i], p = 1.0 + share * q1[i], w = state->w[i];
             double metric = p * p + w * w, along = p / metric, down = w / metric, around = 1.0 / (1.0 + e);
             Stress law;
-            stress_at(problem, 0.5 * log_of(metric) + problem->log_prestretch,
-                      log1p_of(e) + problem->log_prestretch, &law);
+            stress_at(problem, 0.5 * log_of(metric) + problem->log_prestretch, log1p_of(e) + problem->log_prestretch,
+                      &law);
             double tm = law.t1[0] / metric, d = law.h11[0] - 2.0 * law.t1[0], h12 = law.h12[0];
             double qw = d * along * down, ww = d * down * down + tm, we = h12 * down * around;
             /* The slope is eliminated, as Newton does it. */
@@ -54,8 +61,8 @@ static double least_of(int64_t n, const double *x, const double *values) {
     return inside ? smaller(values[lowest], larger(dip, bound)) : values[lowest];
 }
 
-/* Least stiffness d2W-star/dl1^2 along the film, between its points too, as a share of what it is without Maxwell stress:
-   positive where the law is convex. */
+/* Least stiffness d2W-star/dl1^2 along the film, between its points too, as a share of what it is without Maxwell
+   stress: positive where the law is convex. */
 static double margin(Problem *problem, const Grid *grid, const State *state, double lam) {
     int64_t points = grid->table->points, n = 0;
     double log1[MOST_POINTS + 2], hoop[MOST_POINTS + 2], log[3 * STATIONS], rise[STATIONS];
@@ -114,8 +121,8 @@ static int led(Problem *problem, const Grid *grid, const State *begun, const Sta
     return good && jump(CHECK_POINTS, ahead, end->w) < CORRECTION;
 }
 
-/* Whether the state is on the branch from rest: by its energy, or since a few steps of the voltage lead there. `check` is
-   the table of CHECK_MODES. */
+/* Whether the state is on the branch from rest: by its energy, or since a few steps of the voltage lead there. `check`
+   is the table of CHECK_MODES. */
 static int connected(Problem *problem, const Table *check, const Grid *of, const State *state, double lam) {
     State end = *state, begun;
     Grid grid;

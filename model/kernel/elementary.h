@@ -1,7 +1,7 @@
 /* exp, expm1, log and log1p, the same digits on every machine, and without branches, so that loops become vectors.
 
-   An argument beyond what a double can answer gives infinity or NaN, as in the C library. Errors stay below 2.5 units in
-   the last place (tests/model/membrane/test_compiled.py). */
+   An argument beyond what a double can answer gives infinity or NaN, as in the C library. Errors stay below 2.5 units
+   in the last place (tests/model/membrane/test_compiled.py). */
 #ifndef DEA_ELEMENTARY_H
 #define DEA_ELEMENTARY_H
 

@@ -8,10 +8,21 @@
 
 #include "elementary.h"
 
-enum { MOST_PARAMETERS = 8 };   /* moduli, or shape parameters */
-enum { MOST_STATIONS = 48 };    /* points that a law is asked for at once */
+enum {
+    MOST_PARAMETERS = 8
+}; /* moduli, or shape parameters */
+enum {
+    MOST_STATIONS = 48
+}; /* points that a law is asked for at once */
 
-enum { OGDEN, NEO_HOOKE, MOONEY_RIVLIN, YEOH, GENT, LAWS }; /* LAWS of model/membrane/compiled.py, in this order */
+enum {
+    OGDEN,
+    NEO_HOOKE,
+    MOONEY_RIVLIN,
+    YEOH,
+    GENT,
+    LAWS
+}; /* LAWS of model/membrane/compiled.py, in this order */
 
 typedef struct {
     int64_t kind, moduli, shapes;

@@ -1,7 +1,7 @@
 /* The membrane's equilibrium, many states after one another: the kernel of model/membrane/solve.py.
 
-   It treats taut films of one element that are on the branch from rest by a look at their energy, or by few steps of the
-   voltage, and wrinkled ones that the voltage does not soften; every other state is left to the methods for arrays
+   It treats taut films of one element that are on the branch from rest by a look at their energy, or by few steps of
+   the voltage, and wrinkled ones that the voltage does not soften; every other state is left to the methods for arrays
    (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so
    that nothing depends on the others. */
 #include "connected.h"
@@ -135,8 +135,8 @@ static void keep_cut(const Cut *cut, Kept *kept) {
 }
 
 /* Write what a solved state says; returns its status, or LEFT_TO_OTHERS where its numbers overflow. */
-static int64_t place_all(const Film *film, Problem *problem, double h, double voltage, const Extremes *x, const Iterate *found,
-                         int64_t modes, int wrinkled, Answer *out) {
+static int64_t place_all(const Film *film, Problem *problem, double h, double voltage, const Extremes *x,
+                         const Iterate *found, int64_t modes, int wrinkled, Answer *out) {
     out->lam = found->lam;
     out->iterations = found->steps;
     out->modes = modes;
@@ -147,8 +147,8 @@ static int64_t place_all(const Film *film, Problem *problem, double h, double vo
 }
 
 /* A state that is wrinkled by the plain equations, at the points `at`. */
-static int64_t wrinkled_answer(const Task *task, const Film *film, Problem *problem, double h, double voltage, Iterate *found,
-                               const Grid *grid, const State *state, Answer *out, Kept *kept) {
+static int64_t wrinkled_answer(const Task *task, const Film *film, Problem *problem, double h, double voltage,
+                               Iterate *found, const Grid *grid, const State *state, Answer *out, Kept *kept) {
     Cut cut;
     Points plain, at[MOST_ELEMENTS];
     Extremes x;
@@ -214,7 +214,8 @@ static int64_t answer(const Task *task, const Film *film, double h, double volta
 static int is_task(const Task *task) {
     for (int64_t modes = 0; modes <= MOST_MODES; modes++) {
         const Table *table = task->tables[modes];
-        if (table && (modes < 2 || table->modes != modes || table->points != modes + 3 || table->next <= modes)) return 0;
+        if (table && (modes < 2 || table->modes != modes || table->points != modes + 3 || table->next <= modes))
+            return 0;
     }
     for (int64_t k = 0; k < 3; k++)
         if (task->first_modes[k] < 2 || task->first_modes[k] > MOST_MODES) return 0;
@@ -222,8 +223,8 @@ static int is_task(const Task *task) {
     return task->tolerance >= 1e-12 && task->tolerance <= 1e-2;
 }
 
-/* Solve the states (films[which[s]], h[s], voltage[s]), in SI units; `kept` takes their unknowns, or is NULL. Returns how
-   many states have no answer here, or -1 where the task itself makes no sense. */
+/* Solve the states (films[which[s]], h[s], voltage[s]), in SI units; `kept` takes their unknowns, or is NULL. Returns
+   how many states have no answer here, or -1 where the task itself makes no sense. */
 EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t film_count, const int64_t *which,
                                 int64_t states, const double *h, const double *voltage, Answer *answers, Kept *kept) {
     int64_t left = 0;

@@ -4,7 +4,10 @@
 
 #include "refinement.h"
 
-enum { FINE = 33, POLISH = 3 };
+enum {
+    FINE = 33,
+    POLISH = 3
+};
 #define FAR 1.2
 #define HOOP 0.7
 
@@ -47,9 +50,10 @@ static double pull_at(const Grid *grid, const Points *at, const double *test, do
     return sqrt(across * across + down * down) / (inner * inner);
 }
 
-/* Where Newton on an edge's stretch starts, and the nominal stress there. A relaxed element is a straight cone: its slope
-   tells the pull at its end. */
-static double edge_start(const Problem *problem, const Solved *solved, int64_t end, double lam, double *log1, double *log2) {
+/* Where Newton on an edge's stretch starts, and the nominal stress there. A relaxed element is a straight cone: its
+   slope tells the pull at its end. */
+static double edge_start(const Problem *problem, const Solved *solved, int64_t end, double lam, double *log1,
+                         double *log2) {
     int64_t k = end == 0 ? 0 : solved->elements - 1;
     const Grid *grid = &solved->grid[k];
     const Points *at = &solved->at[k];
@@ -66,7 +70,8 @@ static double edge_start(const Problem *problem, const Solved *solved, int64_t e
 
 static void edges(Problem *problem, const Solved *solved, double lam, Edges *out) {
     double lnlp = problem->log_prestretch, pull[2], start1[2], start2[2], log[6];
-    int64_t folded[2] = {solved->folded ? solved->folded[0] : 0, solved->folded ? solved->folded[solved->elements - 1] : 0};
+    int64_t folded[2] = {solved->folded ? solved->folded[0] : 0,
+                         solved->folded ? solved->folded[solved->elements - 1] : 0};
     Stress now;
     for (int64_t end = 0; end < 2; end++) {
         pull[end] = edge_start(problem, solved, end, lam, &start1[end], &start2[end]);
@@ -150,7 +155,8 @@ static double peak(const Table *table, const double *values, int64_t top, double
 }
 
 /* Largest value over the film, from those at the points of every element and at both edges, and R/b where it stands. */
-static double largest(const Solved *solved, const double (*values)[MOST_POINTS], double disk, double ring, double *radius) {
+static double largest(const Solved *solved, const double (*values)[MOST_POINTS], double disk, double ring,
+                      double *radius) {
     const Table *table = solved->grid[0].table;
     double best = larger(disk, ring), inside = -INFINITY, most = -INFINITY, fine[FINE], xi;
     int64_t element = 0, place = 0;
@@ -219,7 +225,8 @@ static void extremes(Problem *problem, const Solved *solved, double lam, Extreme
             log1[k][i] = at->log[i];
             log2[k][i] = at->log[n + i];
             if (problem->field != 0.0)
-                out->softening = larger(out->softening, 2.0 * at->law.maxwell[i] / (at->law.h11[i] + 2.0 * at->law.maxwell[i]));
+                out->softening =
+                    larger(out->softening, 2.0 * at->law.maxwell[i] / (at->law.h11[i] + 2.0 * at->law.maxwell[i]));
         }
     }
     out->log_area = largest(solved, area, edge.log1[0] + edge.log2[0], edge.log1[1] + edge.log2[1], &out->radius);
@@ -239,8 +246,8 @@ typedef struct {
 } Derivatives;
 
 /* dF/dp = d/dh (dE/dp): one tangent, with respect to h, serves every parameter p. This adds what one element gives; the
-   tangent of the force is `stiffness`, `slope` that of the slopes, `dc` that of the functions. A cut stays at its share of
-   the span; the relaxed energy is smooth across it, so its motion changes nothing. */
+   tangent of the force is `stiffness`, `slope` that of the slopes, `dc` that of the functions. A cut stays at its share
+   of the span; the relaxed energy is smooth across it, so its motion changes nothing. */
 static void add_derivatives(const Problem *problem, const Grid *grid, const double *w, const Points *at, int64_t folded,
                             double lam, const double *dc, const double *slope, double stiffness, Derivatives *out) {
     const Stress *law = &at->law;

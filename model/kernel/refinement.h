@@ -5,7 +5,9 @@
 
 #include "ritz.h"
 
-enum { MOST_STEPS = 25 };
+enum {
+    MOST_STEPS = 25
+};
 #define NEWTON_FACTOR 0.3
 #define LEVEL_FACTOR 0.5
 #define ROUND_OFF 1e-13
@@ -15,7 +17,13 @@ enum { MOST_STEPS = 25 };
 #define LONGEST 4.0
 
 /* What a state came to; the first two are numbers of model.membrane.solution.Status. */
-enum { TAUT = 0, WRINKLED = 1, LEFT_TO_OTHERS = -1, NEEDS_TABLE = -2, FOLDED = -3 };
+enum {
+    TAUT = 0,
+    WRINKLED = 1,
+    LEFT_TO_OTHERS = -1,
+    NEEDS_TABLE = -2,
+    FOLDED = -3
+};
 
 /* A state after Newton at one resolution. */
 typedef struct {
@@ -31,9 +39,7 @@ static double larger(double x, double y) { return x > y ? x : y; }
 static double smaller(double x, double y) { return x < y ? x : y; }
 
 /* Change of a slope at which Newton's error is just below the tolerance. */
-static double goal(double tolerance) {
-    return smaller(0.03, larger(1e-6, sqrt(0.9 * tolerance / NEWTON_FACTOR)));
-}
+static double goal(double tolerance) { return smaller(0.03, larger(1e-6, sqrt(0.9 * tolerance / NEWTON_FACTOR))); }
 
 /* Estimated relative error of `now`, after the force `previous` at the resolution before. */
 static double estimate(const Iterate *now, double previous, double tolerance, double factor) {
@@ -123,8 +129,8 @@ static void prolong(const Table *from, const Table *to, const double *matrix, St
 
 /* The state to `tolerance`, at the resolution that it needs. `tables` has one for so many modes at that place, or none.
    `relaxed`: a state whose hoop stress is clearly negative is FOLDED at once. */
-static int refine(Problem *problem, const Table *const *tables, int64_t modes, double tolerance, int relaxed, Grid *grid,
-                  State *state, Iterate *found, double *error) {
+static int refine(Problem *problem, const Table *const *tables, int64_t modes, double tolerance, int relaxed,
+                  Grid *grid, State *state, Iterate *found, double *error) {
     double aim = goal(tolerance), previous = NAN;
     int64_t steps = 0;
     if (!tables[modes]) return NEEDS_TABLE;

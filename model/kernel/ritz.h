@@ -337,8 +337,7 @@ static void guess(Problem *problem, const Grid *grid, State *state) {
     double power = law.t1[0] > 0.0 ? 1.0 - 2.0 * part + part * law.h11[0] / law.t1[0] : 1.0;
     if (!(power > 0.5)) power = 1.0;
     for (int64_t k = 0; k < grid->table->modes; k++) state->c[k] = 0.0;
-    for (int64_t i = 0; i < n; i++)
-        state->w[i] = exp_of(0.5 * problem->span * (1.0 - grid->table->xi[i]) / power);
+    for (int64_t i = 0; i < n; i++) state->w[i] = exp_of(0.5 * problem->span * (1.0 - grid->table->xi[i]) / power);
     double scale = problem->height / dot(n, grid->once, state->w);
     for (int64_t i = 0; i < n; i++) state->w[i] *= scale;
 }

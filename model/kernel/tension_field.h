@@ -1,6 +1,6 @@
-/* Wrinkled films: model/membrane/tension_field.py and wrinkled_cone.py for one state, from a state of the plain equations
-   on. The film is cut where its hoop tension vanishes; a wrinkled element is a straight cone, the others (panels) are as in
-   ritz.h. Whatever does not settle with the zones that it began with is left to others. */
+/* Wrinkled films: model/membrane/tension_field.py and wrinkled_cone.py for one state, from a state of the plain
+   equations on. The film is cut where its hoop tension vanishes; a wrinkled element is a straight cone, the others
+   (panels) are as in ritz.h. Whatever does not settle with the zones that it began with is left to others. */
 #ifndef DEA_TENSION_FIELD_H
 #define DEA_TENSION_FIELD_H
 
@@ -19,8 +19,8 @@ enum {
 #define NEAR 1e-2
 #define SLACK_GOALS 5.0 /* times Newton's goal: share of the largest tension that may have a wrong sign */
 
-/* A film cut in elements. The unknowns are the modes of its elements, one after the other, then the strains e at the cuts;
-   each element has them as coefficients of its modes and of its two hats. */
+/* A film cut in elements. The unknowns are the modes of its elements, one after the other, then the strains e at the
+   cuts; each element has them as coefficients of its modes and of its two hats. */
 typedef struct {
     int64_t elements, folded[MOST_ELEMENTS];
     double breaks[MOST_ELEMENTS + 1];
@@ -214,9 +214,10 @@ static void join(const Cut *cut, int64_t own, int64_t k, const Cone *cone, const
     system->give += spring->give;
 }
 
-/* The cone after a step whose strains at its ends are `dc`, with the force `lam`: `Springs.advance`. Returns its largest
-   relative change. */
-static double bend(const Cut *cut, int64_t k, const double *dc, double lam, const Spring *spring, Cone *cone, double *natural) {
+/* The cone after a step whose strains at its ends are `dc`, with the force `lam`: `Springs.advance`. Returns its
+   largest relative change. */
+static double bend(const Cut *cut, int64_t k, const double *dc, double lam, const Spring *spring, Cone *cone,
+                   double *natural) {
     const Grid *grid = &cut->grid[k];
     double moved = exp_of(grid->right) * dc[1] - exp_of(grid->left) * dc[0], before = cone->pull * cone->sin;
     double h = cone->pull * cone->cos + (spring->miss + moved - spring->skew * (lam - before)) / spring->soft;
@@ -258,7 +259,8 @@ static void unroll(Cut *cut, const Cone *cones) {
     }
 }
 
-/* Breaks moved to where the hoop tension of the panels vanishes, in `breaks`; returns the largest shift over an element. */
+/* Breaks moved to where the hoop tension of the panels vanishes, in `breaks`; returns the largest shift over an
+ * element. */
 static double moved_breaks(const Cut *cut, double (*tension)[MOST_POINTS], double *breaks) {
     const Table *table = cut->grid[0].table;
     double new[MOST_ELEMENTS + 1], largest_shift = 0.0;
@@ -270,7 +272,8 @@ static double moved_breaks(const Cut *cut, double (*tension)[MOST_POINTS], doubl
             double side = end == 0 ? 1.0 : -1.0, length = cut->breaks[k + 1] - cut->breaks[k];
             double other = cut->breaks[beside + 1] - cut->breaks[beside];
             double value = dot(table->points, table->ends + end * table->points, tension[k]);
-            double slope = dot(table->points, table->end_slopes + end * table->points, tension[k]) * cut->grid[k].dxi * side;
+            double slope =
+                dot(table->points, table->end_slopes + end * table->points, tension[k]) * cut->grid[k].dxi * side;
             /* Towards the taut zone where it is not taut, away from it where it pulls at the cut. */
             double sign = value > 0.0 ? 1.0 : value < 0.0 ? -1.0 : 0.0;
             double shift = slope > 0.0 ? -value / slope * side : -0.2 * sign * side * length;
@@ -286,8 +289,8 @@ static double moved_breaks(const Cut *cut, double (*tension)[MOST_POINTS], doubl
 }
 
 /* Newton's system of the panels and springs. */
-static void compose(Problem *problem, const Cut *cut, int64_t own, Cone *cones, Points *at, Reduced *part, Spring *spring,
-                    System *system) {
+static void compose(Problem *problem, const Cut *cut, int64_t own, Cone *cones, Points *at, Reduced *part,
+                    Spring *spring, System *system) {
     int64_t first = 0;
     clear_system(system, own + cut->elements - 1);
     for (int64_t k = 0; k < cut->elements; k++) {
@@ -311,8 +314,8 @@ typedef struct {
 } Changes;
 
 /* A panel's slopes and hoop tension after the step `dc` of its functions: the first half of `refinement.advance`. */
-static void turn(const Cut *cut, int64_t k, const Points *at, const Reduced *part, const double *dc, double lam, double *dw,
-                 Changes *seen) {
+static void turn(const Cut *cut, int64_t k, const Points *at, const Reduced *part, const double *dc, double lam,
+                 double *dw, Changes *seen) {
     const Stress *law = &at->law;
     double de[MOST_POINTS], dq[MOST_POINTS];
     slopes(&cut->grid[k], part, dc, lam, 1, dw);
@@ -419,8 +422,8 @@ static Iterate settle(Problem *problem, Cut *cut, double aim) {
     return found;
 }
 
-/* A film of one element cut where its hoop tension changes sign: `zones`, `_cut` and `remap`. Returns whether there is a
-   wrinkled zone, and not too many. */
+/* A film of one element cut where its hoop tension changes sign: `zones`, `_cut` and `remap`. Returns whether there is
+   a wrinkled zone, and not too many. */
 static int begin_zones(const Grid *grid, const Points *at, Cut *cut) {
     double fine[FINE], span = -grid->left;
     refined(grid->table, at->law.t2, fine);
@@ -496,8 +499,7 @@ static int same_zones(const Cut *cut, const Points *at, double tolerance) {
     double fine[MOST_ELEMENTS][FINE], values[MOST_POINTS], most = 0.0;
     int64_t n = points_of(cut);
     for (int64_t k = 0; k < cut->elements; k++) {
-        for (int64_t i = 0; i < n; i++)
-            values[i] = cut->folded[k] ? at[k].hoop[i] - at[k].log[n + i] : at[k].law.t2[i];
+        for (int64_t i = 0; i < n; i++) values[i] = cut->folded[k] ? at[k].hoop[i] - at[k].log[n + i] : at[k].law.t2[i];
         refined(cut->grid[k].table, values, fine[k]);
         for (int64_t i = 0; i < FINE; i++) most = larger(most, fabs(fine[k][i]));
         if (!(cut->breaks[k + 1] - cut->breaks[k] > -1e-9 * cut->breaks[0])) return 0;
@@ -511,8 +513,9 @@ static int same_zones(const Cut *cut, const Points *at, double tolerance) {
 
 /* From a plain state of one element, whose points are `at`, to the wrinkled one at `tolerance`. `first_modes`: to begin
    with, by the length of the longest element. Returns WRINKLED, with the points in `out`. */
-static int fold(Problem *problem, const Table *const *tables, const int64_t *first_modes, double tolerance, const Grid *grid,
-                const State *state, const Points *at, Cut *cut, Points *out, Iterate *found, double *error) {
+static int fold(Problem *problem, const Table *const *tables, const int64_t *first_modes, double tolerance,
+                const Grid *grid, const State *state, const Points *at, Cut *cut, Points *out, Iterate *found,
+                double *error) {
     double longest = 0.0, previous = NAN, before = INFINITY, aim = goal(tolerance);
     int64_t steps = found->steps, panels = 0;
     if (!begin_zones(grid, at, cut)) return LEFT_TO_OTHERS;
@@ -525,8 +528,10 @@ static int fold(Problem *problem, const Table *const *tables, const int64_t *fir
     for (;;) {
         if (modes > MOST_CUT_MODES) return LEFT_TO_OTHERS;
         if (!tables[modes]) return NEEDS_TABLE;
-        if (!(fabs(previous) < INFINITY)) remap(grid, state, at, tables[modes], cut);
-        else prolong_cut(cut, tables[modes]);
+        if (!(fabs(previous) < INFINITY))
+            remap(grid, state, at, tables[modes], cut);
+        else
+            prolong_cut(cut, tables[modes]);
         *found = settle(problem, cut, aim);
         steps += found->steps;
         found->steps = steps;
@@ -565,7 +570,8 @@ static void cut_derivatives(const Problem *problem, const Cut *cut, const Points
     for (int64_t k = 0; k < cut->elements; k++) {
         local_part(cut, dc, own, k * modes, k, local);
         slopes(&cut->grid[k], &part[k], local, stiffness, 0, dw);
-        add_derivatives(problem, &cut->grid[k], cut->state[k].w, &at[k], cut->folded[k], lam, local, dw, stiffness, out);
+        add_derivatives(problem, &cut->grid[k], cut->state[k].w, &at[k], cut->folded[k], lam, local, dw, stiffness,
+                        out);
     }
 }
 
