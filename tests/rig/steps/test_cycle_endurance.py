@@ -167,7 +167,7 @@ def experiment_of(folder: Path, cycles: int) -> Experiment:
 @pytest.mark.parametrize(
     "cycles",
     [
-        pytest.param(5_000, marks=pytest.mark.slow),
+        pytest.param(2_000, marks=pytest.mark.slow),
         pytest.param(10**6, marks=[pytest.mark.long, pytest.mark.timeout(7200)]),
     ],
 )
