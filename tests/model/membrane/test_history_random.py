@@ -111,6 +111,7 @@ def test_what_is_stated_of_the_error_is_so() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(3600)
 def test_what_is_stated_of_the_error_is_so_of_300_histories() -> None:
     compared, beyond, told = judged(300, 2, (1e-3, 1e-4, 1e-5))
     assert compared > 1200

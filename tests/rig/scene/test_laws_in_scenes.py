@@ -75,7 +75,7 @@ def test_a_simulated_film_without_parameters_is_the_believed_one(tmp_path: Path)
     [
         ('law = "genty"\nmu_Pa = 9e4', ("law 'genty' is not known", "gent", "Did you mean 'gent'?")),
         ('law = "gent"\nmu_Pa = 9e4', ("Jm",)),
-        (f"{GENT}\nalpha = [2.0]", ("alpha", "Allowed here: Jm, breakdown_V_per_um, eps_r, law, max_stretch, mu_Pa, ")),
+        (f"{GENT}\nalpha = [2.0]", ("alpha", "Allowed here: Jm, branches, breakdown_V_per_um, eps_r, law, max_")),
         ('law = "gent"\nmu_Pa = 9e4\nJm = 0.0099', ("Jm", "0.01")),
         ('law = "gent"\nmu_Pa = [9e4]\nJm = 30.0', ("mu_Pa", "number")),
         ('law = "gent"\nmu_Pa = -9e4\nJm = 30.0', ("shear modulus", "must be positive")),
