@@ -17,12 +17,15 @@ if TYPE_CHECKING:
 
 SCENES = ("cone-4mm", "cone-6mm")
 PROTOCOL = "paper"
+VISCOUS_PROTOCOL = "relax"
+BRANCHES = ((0.15, 1.0), (0.2, 15.0))  # ratio and time (s) of what relaxes beside the viscous specimen's film
 
 
 @click.command("demo")
 @click.option("--out", type=FOLDER, help="Directory to make.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the simulation.")
-def command(out: Path | None, seed: int) -> None:
+@click.option("--viscous", is_flag=True, help="One specimen whose film relaxes: fast moves and holds, branches fitted.")
+def command(out: Path | None, seed: int, viscous: bool) -> None:
     """Characterise two simulated specimens, start to finish, and compare with the truth.
 
     Everything it used and made is left in a new directory: scenes, protocol, certificates, logs, fit, report.
@@ -42,10 +45,13 @@ def command(out: Path | None, seed: int) -> None:
         for name in ("scenes", "protocols", "calibrations", "schema"):
             shutil.copytree(fixtures / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     logs = []
-    for number, name in enumerate(SCENES):
+    protocol, scenes = (VISCOUS_PROTOCOL, SCENES[:1]) if viscous else (PROTOCOL, SCENES)
+    for number, name in enumerate(scenes):
         scene_path = folder / "scenes" / f"{name}.toml"
         _set_seed(scene_path, seed + number)
-        experiment = prepare(scene_path, folder / "protocols" / f"{PROTOCOL}.toml")
+        if viscous:
+            _let_relax(scene_path)
+        experiment = prepare(scene_path, folder / "protocols" / f"{protocol}.toml")
         log = folder / f"{name}.mcap"
         with progress(
             f"{name}: {experiment.protocol.title}, {experiment.duration:.0f} s of the bench's time"
@@ -53,14 +59,17 @@ def command(out: Path | None, seed: int) -> None:
             outcome = run_experiment(experiment, log, update)
         click.echo(f"{log}: {outcome.reason}; {outcome.state}.")
         logs.append(log)
-    found = identify_logs(logs)
+    found = identify_logs(logs, branches=len(BRANCHES) if viscous else 0)
     fit, report = folder / "fit.json", folder / "report.html"
     write_results(found, fit, report)
     show(identification_table(found.identification), truth_table(found))
-    click.echo(f"Left in {folder}/: two logs, {fit.name}, {report.name}, and the files they came from.")
+    for sentence in _branches(found) if viscous else ():
+        click.echo(sentence)
+    made = "a log" if viscous else "two logs"
+    click.echo(f"Left in {folder}/: {made}, {fit.name}, {report.name}, and the files they came from.")
     click.echo("Try next, with `uv run` in front:")
     click.echo(f"  dea-rig view {logs[0]}")
-    click.echo(f"  dea-rig check {folder}/scenes/{SCENES[0]}.toml {folder}/protocols/{PROTOCOL}.toml")
+    click.echo(f"  dea-rig check {folder}/scenes/{SCENES[0]}.toml {folder}/protocols/{protocol}.toml")
     click.echo("  change a number there, then: dea-rig run SCENE PROTOCOL -o my.mcap && dea-rig fit my.mcap")
 
 
@@ -96,6 +105,21 @@ def _set_seed(scene: Path, seed: int) -> None:
     if count != 1:
         raise ConfigError(f"{scene}: expected one line `seed = ...` in [simulation].")
     scene.write_text(text, encoding="utf-8")
+
+
+def _let_relax(scene: Path) -> None:
+    """Give the simulated film its branches."""
+    branches = "".join(
+        f"\n[[simulation.film.maxwell]]\nmodulus_ratio = {ratio}\ntime_s = {time}\n" for ratio, time in BRANCHES
+    )
+    scene.write_text(scene.read_text(encoding="utf-8") + branches, encoding="utf-8")
+
+
+def _branches(found: Found) -> list[str]:
+    """The simulation's branches, and what was found of them."""
+    spectrum = found.identification.spectrum
+    truth = "; ".join(f"ratio {ratio:g}, time {time:g} s" for ratio, time in BRANCHES)
+    return [f"Branches of the simulated film: {truth}.", *(() if spectrum is None else spectrum.sentences)]
 
 
 def truth_table(found: Found) -> RenderableType:

@@ -1,4 +1,4 @@
-"""Films that take time by shooting and lines: solve_ivp along the radius within solve_ivp in time, for comparisons only.
+"""Films that take time by shooting and lines: solve_ivp in the radius within solve_ivp in time, for comparisons.
 
 The viscous strains live at Chebyshev's points in ln R and are polynomials between them. At every evaluation of their
 rates the film is shot from disk to ring: of ``r, z, R S1 cos(theta)`` over ln R, with the meridional stretch from

@@ -87,3 +87,16 @@ def test_an_existing_directory_is_left_alone(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["demo", "--out", str(tmp_path)])
     assert result.exit_code == 2 and "exists already" in result.output
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1200)
+def test_a_film_that_relaxes_is_found_with_its_branches(tmp_path: Path) -> None:
+    out = tmp_path / "viscous"
+    result = CliRunner().invoke(main, ["demo", "--viscous", "--out", str(out)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    found = json.loads((out / "fit.json").read_text())
+    assert len(found["spectrum"]["branches"]) == 2
+    quantity = found["quantities"]["eps_r"]
+    assert abs(quantity["value"] - TRUTH.eps_r) < 3 * quantity["standard_uncertainty"]
+    assert "Branches of the simulated film" in result.output
