@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import shutil
 import stat
+import subprocess
 import sys
+import tarfile
+import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -47,6 +52,23 @@ def sources(tmp_path: Path) -> Path:
         if path.suffix in {".c", ".h", ".py"}:
             shutil.copy(path, folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of its own with a library that was really compiled: half a minute on a busy machine."""
+    if build.system_compiler()[0] is None:
+        pytest.skip("no C compiler on this machine")
+    folder = tmp_path_factory.mktemp("once") / "kernel"
+    shutil.copytree(HERE, folder, ignore=shutil.ignore_patterns("__pycache__", "dea_kernel-*"))
+    assert build.compile_kernel(folder, library) == (library.library_path(folder), "cc")
+    return folder
+
+
+@pytest.fixture
+def compiled(compiled_once: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(compiled_once, tmp_path / "compiled"))
 
 
 def put(path: Path, text: str) -> Path:
@@ -156,38 +178,29 @@ def test_what_is_no_library_is_refused(sources: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_real_build_loads_and_a_stale_one_is_refused(sources: Path) -> None:
-    if build.system_compiler()[0] is None:
-        pytest.skip("no C compiler on this machine")
-    path, compiler = build.compile_kernel(sources, library)
-    found, says = library.opened(sources)
+def test_a_real_build_loads_and_a_stale_one_is_refused(compiled: Path) -> None:
+    found, says = library.opened(compiled)
     assert isinstance(found, ctypes.CDLL) and found.dea_kernel_version() == library.VERSION
-    assert says == f"compiled kernel {library.sources_digest(sources)}, {compiler}"
-    (sources / "added.h").write_text("/* changed since */\n", encoding="utf-8")
-    found, says = library.opened(sources)
+    assert says == f"compiled kernel {library.sources_digest(compiled)}, cc"
+    (compiled / "added.h").write_text("/* changed since */\n", encoding="utf-8")
+    found, says = library.opened(compiled)
     assert found is None and "other sources" in says
-    assert built(sources) == [path.name]
+    assert built(compiled) == [library.library_path().name]
 
 
 @pytest.mark.slow
-def test_a_library_of_another_interface_is_refused(sources: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if build.system_compiler()[0] is None:
-        pytest.skip("no C compiler on this machine")
-    build.compile_kernel(sources, library)
+def test_a_library_of_another_interface_is_refused(compiled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "VERSION", library.VERSION + 1)
-    found, says = library.opened(sources)
+    found, says = library.opened(compiled)
     assert found is None and "interface" in says
 
 
 @pytest.mark.slow
-def test_a_failed_build_leaves_a_good_library(sources: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if build.system_compiler()[0] is None:
-        pytest.skip("no C compiler on this machine")
-    build.compile_kernel(sources, library)
+def test_a_failed_build_leaves_a_good_library(compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", str(put(tmp_path / "cc", BAD)))
     with pytest.raises(build.Failed):
-        build.compile_kernel(sources, library)
-    assert library.opened(sources)[0] is not None
+        build.compile_kernel(compiled, library)
+    assert library.opened(compiled)[0] is not None
 
 
 def test_this_installation_has_its_kernel() -> None:
@@ -195,3 +208,44 @@ def test_this_installation_has_its_kernel() -> None:
     if build.system_compiler()[0] is None:
         pytest.skip("no C compiler on this machine")
     assert library.load() is not None, library.says()
+
+
+@pytest.mark.slow
+@POSIX
+def test_wheel_and_source_distribution_of_the_project(tmp_path: Path) -> None:
+    """With a compiler a wheel of this platform with the library; without one a pure wheel that says why."""
+    root = HERE.parents[1]
+    project = tmp_path / "project"
+    not_needed = shutil.ignore_patterns("__pycache__", "logs", "pictures", "dea_kernel-*")
+    for name in ("rig", "drivers", "calibration", "model", "sim_fixtures"):
+        shutil.copytree(root / name, project / name, ignore=not_needed)
+    for name in ("pyproject.toml", "README.md", "LICENSE", ".gitignore"):
+        shutil.copy(root / name, project)
+
+    def contents(target: str, **environment: str) -> tuple[str, set[str]]:
+        out = tmp_path / f"{target}{len(environment)}"
+        command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(out)]
+        subprocess.run(command, cwd=project, env={**os.environ, **environment}, check=True, capture_output=True)
+        (made,) = out.iterdir()
+        if target == "sdist":
+            with tarfile.open(made) as archive:
+                names = {name.partition("/")[2] for name in archive.getnames()}
+        else:
+            names = set(zipfile.ZipFile(made).namelist())
+        return made.name, {name.removeprefix("model/kernel/") for name in names if name.startswith("model/kernel/")}
+
+    sources = {path.name for path in HERE.iterdir() if path.suffix in {".c", ".h", ".py"}}
+    without, found = contents("wheel", CC=str(put(tmp_path / "cc", BAD)))
+    assert without.endswith("-py3-none-any.whl")
+    assert found == sources | {library.reason_path().name}
+    if build.system_compiler()[0] is not None:
+        made, found = contents("wheel")
+        assert not made.endswith("-any.whl") and "-py3-none-" in made
+        assert found == sources | {library.library_path().name}
+    _, found = contents("sdist")
+    assert found == sources
+
+
+def test_uv_builds_anew_when_a_source_changes() -> None:
+    keys = tomllib.loads((HERE.parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["uv"]["cache-keys"]
+    assert {"file": "model/kernel/*.{c,h,py}"} in keys and {"file": "pyproject.toml"} in keys
