@@ -34,6 +34,8 @@ from model.verification import baselines
 from model.verification.baselines import Result
 from model.verification.reference import Reference, reference
 from rig.benchmark.cases import Case, taut_cases
+from rig.benchmark.histories import Along, along_histories
+from rig.benchmark.histories import table as along_table
 from rig.benchmark.ratios import Job, Ratio, lines, measured
 
 if TYPE_CHECKING:
@@ -136,6 +138,7 @@ class Report:
     one_off: dict[str, float]  # seconds
     environment: dict[str, str]
     notes: list[str] = field(default_factory=list)
+    along: list[Along] = field(default_factory=list)  # films that take time, along histories
 
 
 def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None) -> Report:
@@ -240,6 +243,7 @@ def measure(
         one_off=_one_off() if details else {},
         environment={**environment, "load after": _load()},
         notes=notes,
+        along=along_histories(full) if details else [],
     )
 
 
@@ -572,7 +576,7 @@ def render(report: Report) -> RenderableType:
         f"One-off costs, not counted above: {one_off}." if one_off else "",
         *report.notes,
     ]
-    return Group(table, speed, size, *(text for text in texts if text))
+    return Group(table, speed, size, along_table(report.along), *(text for text in texts if text))
 
 
 def ratio_lines(report: Report) -> str:

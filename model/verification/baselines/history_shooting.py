@@ -26,7 +26,8 @@ class _Film:
     def __init__(self, specimen: Specimen, tolerance: float) -> None:
         material = specimen.material
         shear = material.shear_modulus
-        self.point = material.law.point([one / shear for one in material.mu], material.alpha)
+        mu, alpha = material.powers
+        self.terms = [(one / shear, power) for one, power in zip(mu, alpha, strict=True)]
         self.branches = [(one.ratio, one.time) for one in material.branches]
         self.electric = material.permittivity / (specimen.thickness**2 * shear)
         self.lp, self.ring = specimen.prestretch, specimen.ring_radius
@@ -36,11 +37,21 @@ class _Film:
         self.nodes = 0.5 * self.left * (1.0 - at)
         self.weights = (-1.0) ** np.arange(NODES) * np.sin(np.pi * (np.arange(NODES) + 0.5) / NODES)
         self.tolerance = tolerance
-        s1, *_ = self.point(math.log(self.lp), math.log(self.lp))
+        s1, _, _ = self.point(math.log(self.lp), math.log(self.lp))
         self.unknown = np.array([math.exp(self.left) * s1 / self.lp, 0.0])  # horizontal pull at the disk, force
         self.slopes: Array | None = None
         self.last = 0.0  # height at which it was met
         self.start = math.log(self.lp)
+
+    def point(self, log1: float, log2: float) -> tuple[float, float, float]:
+        """Stresses, and the slope of the first by the first logarithmic stretch."""
+        s1 = s2 = s11 = 0.0
+        for mu, alpha in self.terms:
+            through = mu * math.exp(-alpha * (log1 + log2))
+            along = mu * math.exp(alpha * log1)
+            s1, s2 = s1 + along - through, s2 + mu * math.exp(alpha * log2) - through
+            s11 += alpha * (along + through)
+        return s1, s2, s11
 
     def between(self, viscous: Array, x: float) -> list[list[float]]:
         """Viscous strains (2, K, N) at ``x = ln(R/b)``."""
@@ -60,9 +71,9 @@ class _Film:
         v1, v2 = self.between(viscous, x) if self.branches else ([], [])
         wanted, log1 = pull * math.exp(-x), self.start
         for _ in range(60):
-            s1, s2, h11, *_ = self.point(log1, log2)
+            s1, s2, h11 = self.point(log1, log2)
             for (ratio, _), one, two in zip(self.branches, v1, v2, strict=True):
-                p1, p2, c11, *_ = self.point(log1 - one, log2 - two)
+                p1, p2, c11 = self.point(log1 - one, log2 - two)
                 s1, s2, h11 = s1 + ratio * p1, s2 + ratio * p2, h11 + ratio * c11
             maxwell = field * math.exp(2.0 * (log1 + log2))
             s1, s2, h11 = s1 - maxwell, s2 - maxwell, h11 - 2.0 * maxwell
@@ -139,7 +150,7 @@ class _Film:
         for k, x in enumerate(self.nodes.tolist()):
             log1, log2, _ = self.strains(x, float(r[k]), math.hypot(float(pull[k]), force), viscous, field)
             for b, (_, time) in enumerate(self.branches):
-                s1, s2, *_ = self.point(log1 - viscous[0, b, k], log2 - viscous[1, b, k])
+                s1, s2, _ = self.point(log1 - viscous[0, b, k], log2 - viscous[1, b, k])
                 found[:, b, k] = (2.0 * s1 - s2) / (6.0 * time), (2.0 * s2 - s1) / (6.0 * time)
         return found
 
