@@ -36,6 +36,7 @@ class HistoryCase:
     voltage: list[float]
     times: list[float]
     tolerance: float
+    sensitivities: bool
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ def solve_cases(cases: Any) -> list[dict[str, Any]]:
     A film that takes time has ``material {..., branches: [{ratio, time_s}, ...]}``, and in place of ``h`` and
     ``voltage`` the case has ``history {t: [...], h: [...], voltage: [...]}``, linear in between, and the ``times`` (s)
     at which answers are wanted. Then ``status, F, error_estimate, peak_field, min_hoop_stress`` are lists over
-    ``times``; the error is over the largest force of the history, and ``tolerance`` is 1e-6 when left out. Without a
-    history the film is the relaxed one.
+    ``times``; the error is over the largest force of the history, and ``tolerance`` is 1e-6 when left out. With
+    ``sensitivities`` true there is also ``dF``: derivatives of F, as `model.membrane.history.History.dforce`, lists
+    over ``times``, of several parameters with a list each time. Without a history the film is the relaxed one.
 
     Raises
     ------
@@ -104,7 +106,7 @@ _FIELDS = {
     "min_hoop_stress": "min_hoop_stress",
     "max_stretch": "max_stretch",
 }
-_ORDER = ("id", "status", *_FIELDS, "iterations", "message")
+_ORDER = ("id", "status", *_FIELDS, "dF", "iterations", "message")
 
 
 def _numbers(found: Solutions | None, at: int) -> dict[str, Any]:
@@ -118,15 +120,24 @@ def _numbers(found: Solutions | None, at: int) -> dict[str, Any]:
 
 def _along(case: HistoryCase) -> dict[str, Any]:
     """Answers of a case along a history."""
-    found = solve_history(case.specimen, case.t, case.h, case.voltage, case.times, tolerance=case.tolerance)
+    course = case.t, case.h, case.voltage, case.times
+    found = solve_history(case.specimen, *course, tolerance=case.tolerance, sensitivities=case.sensitivities)
     status = [Status(int(one)) for one in found.status]
     answer: dict[str, Any] = {"status": [one.name.lower() for one in status]}
     for key, name in _FIELDS.items():
         if hasattr(found, name):
-            values = getattr(found, name).tolist()
-            answer[key] = [value if math.isfinite(value) else None for value in values]
+            answer[key] = _or_none(getattr(found, name).tolist())
+    if found.dforce is not None:
+        answer["dF"] = {key: _or_none(value.tolist()) for key, value in found.dforce.items()}
     lost = [one.message for one in status if one > Status.WRINKLED]
     return answer | {"iterations": found.steps} | ({"message": lost[0]} if lost else {})
+
+
+def _or_none(value: Any) -> Any:
+    """Numbers in lists, None for those that are not finite."""
+    if isinstance(value, list):
+        return [_or_none(one) for one in value]
+    return value if math.isfinite(value) else None
 
 
 def read_history_case(raw: Any) -> HistoryCase:
@@ -136,14 +147,17 @@ def read_history_case(raw: Any) -> HistoryCase:
     ------
     CaseError, ValueError : the case does not describe a film or a history
     """
-    table = _table(raw, "the case", (*ALONG, "tolerance"), ALONG)
+    table = _table(raw, "the case", (*ALONG, "tolerance", "sensitivities"), ALONG)
     history = _table(table["history"], "history", ("t", "h", "voltage"), ("t", "h"))
     t, h, times = _list(history["t"], "history.t"), _list(history["h"], "history.h"), _list(table["times"], "times")
     voltage = _list(history.get("voltage", [0.0] * len(t)), "history.voltage")
     a, b, thickness, prestretch = (_number(table[key], key) for key in ("a", "b", "thickness", "prestretch"))
     film = Specimen(a, b, thickness, prestretch, _material(table["material"]))
     tolerance = _number(table.get("tolerance", 1e-6), "tolerance")
-    return HistoryCase(film, list(t), list(h), list(voltage), list(times), tolerance)
+    slopes = table.get("sensitivities", False)
+    if not isinstance(slopes, bool):
+        raise CaseError(f"sensitivities must be true or false, not {_kind(slopes)}")
+    return HistoryCase(film, list(t), list(h), list(voltage), list(times), tolerance, slopes)
 
 
 def read_case(raw: Any) -> Case:

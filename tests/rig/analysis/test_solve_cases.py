@@ -147,3 +147,20 @@ def test_a_case_along_a_history() -> None:
     assert found[7]["F"] == pytest.approx(0.2156961965381, rel=1e-7)
     assert found[8]["status"] == "invalid" and "times" in found[8]["message"]
     assert found[9]["F"] == pytest.approx(found[0]["F"], rel=1e-4)
+
+
+def test_derivatives_along_a_history() -> None:
+    """A list over the times, of several moduli a list each time; moduli and permittivity together scale the force."""
+    branches = [{"ratio": 0.1, "time_s": 1.0}, {"ratio": 0.2, "time_s": 9.0}]
+    material = {"mu": [5e3, 3.5e4], "alpha": [2.5, 5.6], "eps_r": 1.7, "branches": branches}
+    case = {"id": 1, "a": 4e-3, "b": 20e-3, "thickness": 40e-6, "prestretch": 1.2, "material": material}
+    case |= {"history": {"t": [0, 2], "h": [0, 8e-3], "voltage": [0, 800]}, "times": [1.0, 2.0], "tolerance": 1e-4}
+    found, wrong = solve_cases([case | {"sensitivities": True}, case | {"sensitivities": 1}])
+    assert "dF" not in solve_cases([case])[0]
+    slopes = found["dF"]
+    assert all(len(value) == 2 for value in slopes.values())
+    assert [len(slopes[key][0]) for key in ("mu", "alpha", "ratio", "time")] == [2, 2, 2, 2]
+    for k in (0, 1):
+        scaled = sum(m * d for m, d in zip(material["mu"], slopes["mu"][k], strict=True)) + 1.7 * slopes["eps_r"][k]
+        assert scaled == pytest.approx(found["F"][k], rel=2e-3)
+    assert wrong["status"] == "invalid" and "true or false" in wrong["message"]
