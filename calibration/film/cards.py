@@ -24,7 +24,7 @@ Gent           ``-mu Jm/2 ln(1 - J1/Jm)``          none                    ``mu,
 =============  ==================================  ======================  =============================
 
 All are in Pa and metres. The film is incompressible; where a program asks for a bulk modulus it gets `BULK` times the
-small-strain shear modulus.
+small-strain shear modulus. Branches of a film that takes time: `calibration.film.prony`.
 
 Sources: Abaqus Materials Guide, "Hyperelastic behavior of rubberlike materials"; Ansys Material Reference,
 "Hyperelasticity" (NEO, MOONEY, YEOH, GENT, OGDEN); COMSOL Structural Mechanics Module User's Guide, "Hyperelastic
@@ -34,8 +34,9 @@ Material"; FEBio User Manual, "Uncoupled materials" (incomp neo-Hookean, Mooney-
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from calibration.film.prony import at_once, over_instant, over_relaxed
 from model.material.gent import Gent
 from model.material.law import Law
 from model.material.materials import EPSILON_0, Material
@@ -46,6 +47,7 @@ from model.material.yeoh import Yeoh
 
 BULK = 1000.0
 MOST_TERMS = {"FEBio": 6, "Ansys": 9}  # of Ogden's law
+MOST_BRANCHES = {"FEBio": 6, "Ansys": 6}  # of a card
 
 
 class CardError(ValueError):
@@ -139,8 +141,10 @@ def abaqus(material: Material, law: Constants) -> str:
         [
             *(f"** {line}" for line in _head(material, law)),
             f"*MATERIAL, NAME={_name(material)}",
-            f"*HYPERELASTIC, {law.key}",
+            f"*HYPERELASTIC, {law.key}" + (", MODULI=LONG TERM" if material.branches else ""),
             *lines,
+            *(["*VISCOELASTIC, TIME=PRONY"] if material.branches else []),
+            *(f"{_number(g)}, 0., {_number(tau)}" for g, tau in over_instant(material)),
             "*DIELECTRIC",
             _number(EPSILON_0 * material.eps_r),
             "",
@@ -161,6 +165,8 @@ def ansys(material: Material, law: Constants) -> str:
             *(f"! {line}" for line in _head(material, law)),
             f"TB,HYPER,1,1,{law.key}",
             *lines,
+            *([f"TB,PRONY,1,1,{len(material.branches)},SHEAR"] if material.branches else []),
+            *(f"TBDATA,{2 * k + 1},{_number(a)},{_number(tau)}" for k, (a, tau) in enumerate(over_instant(material))),
             f"MP,PERX,1,{_number(material.eps_r)}",
             "",
         ]
@@ -174,21 +180,39 @@ def comsol(material: Material, law: Constants) -> str:
     for name, value in law.values:
         unit = "" if name in law.unit_less else "[Pa]"
         lines.append(f'{name} {_number(value)}{unit} "{material.law.title}: {name}"')
+    for k, (factor, tau) in enumerate(over_relaxed(material), start=1):
+        lines.append(f'beta_v{k} {_number(factor)} "energy factor of branch {k} of the generalized Maxwell model"')
+        lines.append(f'tau_v{k} {_number(tau)}[s] "relaxation time of branch {k}"')
     lines += [f'epsilonr {_number(material.eps_r)} "relative permittivity"', ""]
     return "\n".join(lines)
 
 
 def febio(material: Material, law: Constants) -> str:
     """A material of a model file (uncoupled)."""
+    elastic = [
+        *(f"  <{name}>{_number(value)}</{name}>" for name, value in law.values),
+        f"  <k>{_number(BULK * material.shear_modulus)}</k>",
+    ]
+    kind = f'<material id="1" name="{_name(material)}" type="{{}}">'
+    body = [kind.format(law.key), *elastic]
+    if material.branches:
+        series = list(enumerate(over_relaxed(material), start=1))
+        body = [
+            kind.format("uncoupled viscoelastic"),
+            "  <g0>1.</g0>",
+            *(f"  <g{k}>{_number(ratio)}</g{k}>" for k, (ratio, _) in series),
+            *(f"  <t{k}>{_number(tau)}</t{k}>" for k, (_, tau) in series),
+            f'  <elastic type="{law.key}">',
+            *(f"  {line}" for line in elastic),
+            "  </elastic>",
+        ]
     return "\n".join(
         [
             "<!--",
             *(line.replace("--", "- -") for line in _head(material, law)),
             "FEBio has no permittivity in this material.",
             "-->",
-            f'<material id="1" name="{_name(material)}" type="{law.key}">',
-            *(f"  <{name}>{_number(value)}</{name}>" for name, value in law.values),
-            f"  <k>{_number(BULK * material.shear_modulus)}</k>",
+            *body,
             "</material>",
             "",
         ]
@@ -203,6 +227,8 @@ class Program:
     file: str
     forms: Forms
     write: Callable[[Material, Constants], str]
+    branches: str  # its convention of a Prony series
+    instant: bool = False  # whether it asks for the moduli that the film has at once
 
     def missing(self, material: Material) -> str:
         """Why there is no card for the material; "" where there is one."""
@@ -211,14 +237,16 @@ class Program:
         most = MOST_TERMS.get(self.name, len(material.mu))
         if material.law is Ogden and len(material.mu) > most:
             return f"{self.name}'s Ogden material has {most} terms at most, and this one has {len(material.mu)}"
+        if len(material.branches) > MOST_BRANCHES.get(self.name, len(material.branches)):
+            return f"{self.name}'s card has {MOST_BRANCHES[self.name]} branches at most"
         return ""
 
 
 PROGRAMS = (
-    Program("Abaqus", "film_abaqus.inp", ABAQUS, abaqus),
-    Program("Ansys", "film_ansys.mac", ANSYS, ansys),
-    Program("COMSOL", "film_comsol.txt", COMSOL, comsol),
-    Program("FEBio", "film_febio.xml", FEBIO, febio),
+    Program("Abaqus", "film_abaqus.inp", ABAQUS, abaqus, "moduli of the relaxed film; g_k over the modulus at once"),
+    Program("Ansys", "film_ansys.mac", ANSYS, ansys, "moduli at once; alpha_k over the modulus at once", True),
+    Program("COMSOL", "film_comsol.txt", COMSOL, comsol, "moduli of the relaxed film; beta_v over the relaxed film"),
+    Program("FEBio", "film_febio.xml", FEBIO, febio, "moduli of the relaxed film; g_k over the relaxed film, g0 = 1"),
 )
 
 
@@ -233,7 +261,15 @@ def material_cards(material: Material) -> dict[str, str]:
     able = [one for one in PROGRAMS if not one.missing(material)]
     if not able:
         raise CardError(f"there is no material card for this film: {'; '.join(without_card(material))}")
-    return {one.file: one.write(material, one.forms[material.law](material)) for one in able}
+    return {one.file: _card(one, material) for one in able}
+
+
+def _card(program: Program, material: Material) -> str:
+    own = at_once(material) if material.branches and program.instant else material
+    law = program.forms[material.law](own)
+    if material.branches:
+        law = replace(law, energy=f"{law.energy}; branches: {program.branches}")
+    return program.write(own, law)
 
 
 def without_card(material: Material) -> list[str]:
@@ -243,8 +279,14 @@ def without_card(material: Material) -> list[str]:
 
 def _head(material: Material, law: Constants) -> list[str]:
     own = f"{OURS}, G = 1/2 sum mu_n alpha_n" if material.law is Ogden else material.law.description.split(". ")[0]
+    times = (
+        ["Its branches rest in the undeformed film here: stretch it first and let it rest, as the rig does."]
+        if material.branches
+        else []
+    )
     return [
         "Film identified by dea-rig, in Pa and m. Its density is not known; add it.",
+        *times,
         f"Convention of this card: {law.energy}",
         f"Convention of dea-rig: {own}",
         f"Small-strain shear modulus {_number(material.shear_modulus)} Pa, relative permittivity {material.eps_r:.6g}",

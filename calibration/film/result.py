@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from calibration.rounding import two_digits
 from model.material.materials import Material
 from model.membrane.solve import Wrinkling
+
+if TYPE_CHECKING:
+    from calibration.film.branches.result import Spectrum
 
 Array = NDArray[np.float64]
 
@@ -274,129 +277,6 @@ class Posterior:
 
 
 @dataclass(frozen=True)
-class FoundBranch:
-    """A Maxwell branch: ratio (over the relaxed film) and time (s) with standard uncertainties; the time's is relative.
-
-    ``verdict`` is "identified", "bounded" or "outside the window". ``ratios`` and ``times`` (s) are 95 % limits.
-    """
-
-    ratio: float
-    ratio_uncertainty: float
-    time: float
-    time_relative: float
-    verdict: str
-    ratios: tuple[float, float]
-    times: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class BranchCount:
-    """A number of branches: AICc over the least of all, and what was left out over its noise (near 1: predicted)."""
-
-    branches: int
-    aicc: float
-    held_out: float
-
-
-@dataclass(frozen=True, eq=False)
-class Trace:
-    """One run over time: mean forces (N) that were fitted, their deviations, and the model with and without branches.
-
-    ``segment`` numbers the stretches between bends of the history, of which ``moving`` says where the disk moved.
-    """
-
-    run: str
-    time: Array
-    h: Array
-    voltage: Array
-    measured: Array
-    deviation: Array
-    model: Array
-    relaxed: Array
-    segment: NDArray[np.intp]
-    moving: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """What a record tells of a film's branches.
-
-    Attributes
-    ----------
-    branches : tuple of FoundBranch
-        From the quickest on.
-    window : (float, float)
-        Relaxation times (s) that the record can show: two samples, and its length.
-    instant : Quantity
-        Stiffness of the film with all its branches against a quick move from rest (Pa), at the stretches of
-        ``stiffness_fixed``, which is the relaxed one.
-    counts : tuple of BranchCount
-        The numbers of branches that were tried.
-    slow : float
-        A relaxation time (s) from which on a branch of a usual size would look like stiffness.
-    hold : float
-        How long the film has to be held to see that one (s).
-    quick : float
-        A relaxation time (s) below which such a branch would not show either; 0 where there is none.
-    traces : tuple of Trace
-    """
-
-    branches: tuple[FoundBranch, ...]
-    window: tuple[float, float]
-    instant: Quantity
-    counts: tuple[BranchCount, ...]
-    slow: float
-    hold: float
-    quick: float
-    traces: tuple[Trace, ...] = ()
-
-    @property
-    def sentences(self) -> list[str]:
-        """For the operator: what was found and what the record cannot show."""
-        words = []
-        for one in self.branches:
-            low, high = one.times
-            words.append(
-                f"branch: ratio {one.ratio:.3g} +- {one.ratio_uncertainty:.1g}, time {one.time:.3g} s (95 %: {low:.3g} "
-                f"to {high:.3g} s): {one.verdict}"
-            )
-        if not self.branches:
-            words.append("no branch is needed to explain this record")
-        words.append(f"a branch of {self.slow:.0f} s would look like stiffness; hold {_minutes(self.hold)} to see it")
-        if self.quick > 0.0:
-            words.append(f"a branch of {self.quick:.2g} s would not show; move faster to see it")
-        return words
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, without the traces."""
-        return {
-            "branches": [
-                {
-                    "ratio": one.ratio,
-                    "ratio_standard_uncertainty": _finite(one.ratio_uncertainty),
-                    "time_s": one.time,
-                    "time_relative_standard_uncertainty": _finite(one.time_relative),
-                    "ratio_interval_95": [_finite(end) for end in one.ratios],
-                    "time_interval_95_s": [_finite(end) for end in one.times],
-                    "verdict": one.verdict,
-                }
-                for one in self.branches
-            ],
-            "window_s": list(self.window),
-            "instantaneous_stiffness": quantity_dict(self.instant),
-            "counts": [asdict(one) for one in self.counts],
-            "looks_like_stiffness_from_s": self.slow,
-            "hold_to_see_it_s": self.hold,
-            "does_not_show_below_s": self.quick,
-            "sentences": self.sentences,
-        }
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
-
-
-@dataclass(frozen=True)
 class Identification:
     """Everything that a set of curves says about a film.
 
@@ -582,10 +462,10 @@ class Identification:
                         "name": one.name,
                         "family": one.family,
                         "amplitude": one.amplitude,
-                        "standard_uncertainty": _finite(one.uncertainty),
+                        "standard_uncertainty": finite(one.uncertainty),
                         "unit": one.unit,
                         "probability": one.probability,
-                        "shows_from": _finite(one.shows_from),
+                        "shows_from": finite(one.shows_from),
                         "unseen_size": one.unseen_size,
                         "counted_in_budget_as": one.part,
                         "shift_unseen": self.unseen[one.name],
@@ -602,7 +482,7 @@ class Identification:
             "parameters": self.parameters,
             "correlation": self.correlation,
             "covariance": self.covariance,
-            "condition_number": _finite(self.condition),
+            "condition_number": finite(self.condition),
             "aicc": self.aicc,
             "bic": self.bic,
             "held_out": [
@@ -621,12 +501,12 @@ class Identification:
                     "samples_used": c.used,
                     "excluded": c.excluded,
                     "wrinkled": c.wrinkled,
-                    "rms_residual_N": _finite(c.rms_residual),
-                    "rms_expected_N": _finite(c.rms_expected),
-                    "lag1_autocorrelation": _finite(c.lag1_autocorrelation),
+                    "rms_residual_N": finite(c.rms_residual),
+                    "rms_expected_N": finite(c.rms_expected),
+                    "lag1_autocorrelation": finite(c.lag1_autocorrelation),
                     "mean_residual_loading_N": c.mean_residual_loading,
                     "mean_residual_unloading_N": c.mean_residual_unloading,
-                    "interpolation_error_N": _finite(c.interpolation_error),
+                    "interpolation_error_N": finite(c.interpolation_error),
                 }
                 for c in self.curves
             ],
@@ -645,19 +525,20 @@ class Identification:
 
 def quantity_dict(quantity: Quantity) -> dict[str, Any]:
     return {
-        "value": _finite(quantity.value),
-        "standard_uncertainty": _finite(quantity.uncertainty),
+        "value": finite(quantity.value),
+        "standard_uncertainty": finite(quantity.uncertainty),
         "unit": quantity.unit,
-        "budget": {part: _finite(value) for part, value in quantity.budget.items()},
+        "budget": {part: finite(value) for part, value in quantity.budget.items()},
         "share_of_variance": {part: quantity.share(part) for part in quantity.budget},
-        "standard_uncertainty_given_dimensions": _finite(quantity.conditional),
+        "standard_uncertainty_given_dimensions": finite(quantity.conditional),
         "verdict": quantity.verdict,
         "verdict_given_dimensions": quantity.conditional_verdict,
         "doubt": quantity.doubt,
         "at_bound": quantity.at_bound,
-        "interval_95": None if quantity.interval is None else [_finite(end) for end in quantity.interval],
+        "interval_95": None if quantity.interval is None else [finite(end) for end in quantity.interval],
     }
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """A number for JSON, which has no other than finite ones."""
     return value if math.isfinite(value) else None

@@ -127,7 +127,7 @@ def summarise(
         provenance=provenance,
         assumed=assumed_parts(used_curves),
         measurement=most_useful(quantities, used_curves),
-        elastic_error=_elastic_error(doubts, stated.unseen, quantities),
+        elastic_error=_elastic_error(doubts, problem, problem.film(x), held),
     )
     if misfit > WRONG_MODEL:
         lost = {
@@ -150,25 +150,24 @@ def summarise(
 
 
 def _elastic_error(
-    doubts: Sequence[Suspect], unseen: Mapping[str, Mapping[str, float]], quantities: Mapping[str, Quantity]
+    doubts: Sequence[Suspect], problem: Problem, film: Material, held: Mapping[str, float]
 ) -> dict[str, float]:
     """By how much (relative) results are off by a viscosity that shows and was not fitted; empty where none does.
 
     Other imperfections that cost energy look like it in part: it counts where it explains half as much as the best.
     """
     able = [one for one in doubts if one.possible and math.isfinite(one.uncertainty)]
-    viscous = [one for one in able if one.family == VISCOUS and one.significant]
-    if not viscous:
-        return {}
 
     def explains(one: Suspect) -> float:
         return (one.amplitude / one.uncertainty) ** 2
 
-    best = max(viscous, key=explains)
-    if explains(best) < 0.5 * max(explains(one) for one in able):
+    viscous = [explains(one) for one in able if one.family == VISCOUS and one.significant]
+    if not viscous or max(viscous) < 0.5 * max(explains(one) for one in able):
         return {}
-    size = best.amplitude / best.unseen_size
-    return {name: size * shift / quantities[name].value for name, shift in unseen[best.name].items()}
+    from calibration.film.branches.estimate import error_of_elastic_fit
+
+    used = [problem.curves[i] for i in dict.fromkeys(problem.active)]
+    return error_of_elastic_fit(used, film, held)
 
 
 def _viscous(quantity: Quantity) -> Quantity:

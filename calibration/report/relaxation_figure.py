@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.result import Spectrum, Trace
+from calibration.film.branches.result import Spectrum, Trace
 from calibration.report.figures import STYLES, svg
 
 Array = NDArray[np.float64]

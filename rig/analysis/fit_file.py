@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.material.laws import find_law
-from model.material.materials import Material
+from model.material.materials import Branch, Material
 from model.material.ogden import Ogden
 from rig.base.errors import ConfigError
 from rig.base.json_text import parse_json
@@ -51,12 +51,20 @@ def read_fit(path: Path, believed: Material) -> FittedFilm:
             eps_r=values.get("eps_r", believed.eps_r),
             source=str(path),
             law=law,
+            branches=_branches(fit["spectrum"]["branches"]) if "spectrum" in fit else believed.branches,
         )
     except KeyError as error:
         raise ConfigError(f"{path}: not a usable result of `dea-rig fit -o`: the key {error} is missing.") from None
     except (TypeError, ValueError, OverflowError, IndexError) as error:
         raise ConfigError(f"{path}: not a usable result of `dea-rig fit -o`: {error}.") from None
     return FittedFilm(material, names, covariance)
+
+
+def _branches(found: object) -> tuple[Branch, ...]:
+    """The Maxwell branches that `dea-rig fit --branches` found."""
+    if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+        raise ValueError("spectrum.branches must be a list of objects")
+    return tuple(Branch(_number(one["ratio"], "a ratio"), _number(one["time_s"], "a time")) for one in found)
 
 
 def _names(parameters: object) -> tuple[str, ...]:

@@ -99,14 +99,14 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
     if terms == 1 and specimen.material.terms > 1:
         lp = specimen.prestretch
         specimen = specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
-    h, voltage, sweep_h, sweep_v = _reachable(scene, specimen)
-    fixed = _duration(_protocol(scene, certificates, [], float(h.max())), scene)
+    h, voltage, sweep_h, sweep_v = reachable(scene, specimen)
+    fixed = _duration(framed(scene, certificates, [], float(h.max())), scene)
     if not time > fixed + 2.0 * LEAST_DWELL:
         raise LimitError(
             f"{time:.0f} s are not enough: homing, zero, approach, preconditioning and return take {fixed:.0f} s. "
             "Give more time."
         )
-    sweep = _sweep(scene, certificates, time, sweep_h, sweep_v)
+    sweep = uniform_sweep(scene, certificates, time, sweep_h, sweep_v)
     curves = recorded(sweep, scene, certificates, specimen)
     stated = expected(curves, specimen.material)
     errors = curves[0]
@@ -124,7 +124,7 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
         there = expected(recorded(protocol, scene, certificates, specimen), specimen.material)
         design = _design(protocol, scene, there, stated.stretch[0])
         title = f"# Planned for {scene.specimen.name}: {time / 60:.3g} min of the rig.\n"
-        found = Proposal(design, uniform, wanted, route, title + _text(protocol))
+        found = Proposal(design, uniform, wanted, route, title + protocol_text(protocol))
         if best is None or found.gain > best.gain:
             best = found
     if best is None:
@@ -132,7 +132,7 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
     return best
 
 
-def _reachable(scene: Scene, specimen: Specimen) -> tuple[Array, Array, float, float]:
+def reachable(scene: Scene, specimen: Specimen) -> tuple[Array, Array, float, float]:
     """Displacements and voltages at which the film may be held; displacement and voltage of the best uniform sweep."""
     limits = Limits.of(scene)
     top_h = MARGIN * limits.displacement.high
@@ -160,7 +160,7 @@ def _reachable(scene: Scene, specimen: Specimen) -> tuple[Array, Array, float, f
     return h[allowed], voltage[allowed], sweep_h, float(best)
 
 
-def _protocol(
+def framed(
     scene: Scene, certificates: Mapping[str, Certificate], middle: Sequence[Step], top_h: float, title: str = ""
 ) -> Protocol:
     """A protocol with ``middle`` as its measuring steps, framed by what every one needs."""
@@ -182,7 +182,9 @@ def _protocol(
     )
 
 
-def _sweep(scene: Scene, certificates: Mapping[str, Certificate], time: float, top_h: float, top_v: float) -> Protocol:
+def uniform_sweep(
+    scene: Scene, certificates: Mapping[str, Certificate], time: float, top_h: float, top_v: float
+) -> Protocol:
     """The uniform sweep of Cao & Conn 2018: up and back at three voltages, as slowly as the time allows."""
     voltages = [0.0, *(float(round(share * top_v / 10.0) * 10.0) for share in (2.0 / 3.0, 1.0))] if top_v else [0.0]
 
@@ -190,7 +192,7 @@ def _sweep(scene: Scene, certificates: Mapping[str, Certificate], time: float, t
         sweep = Sweep(
             do="sweep", displacement_mm=_mm(top_h), speed_mm_per_s=speed, voltages_V=voltages, settle_s=SETTLE_S
         )
-        return _protocol(scene, certificates, [sweep], top_h, "Uniform sweep")
+        return framed(scene, certificates, [sweep], top_h, "Uniform sweep")
 
     fast, slow = scene.limits.speed_mm_per_s, 1e-3
     if _duration(at(fast), scene) > time:
@@ -206,7 +208,7 @@ def _trimmed(scene: Scene, certificates: Mapping[str, Certificate], route: Seque
     top_h = max(dwell.h for dwell in route)
     for _ in range(3):
         middle = _steps(route, scene)
-        protocol = _protocol(scene, certificates, middle, top_h, f"Planned: {len(route)} holds")
+        protocol = framed(scene, certificates, middle, top_h, f"Planned: {len(route)} holds")
         spare = time - _duration(protocol, scene)
         held = sum(dwell.seconds for dwell in route)
         route = [
@@ -308,7 +310,7 @@ def _mm(metres: float) -> float:
     return round(1e3 * metres, 2)
 
 
-def _text(protocol: Protocol) -> str:
+def protocol_text(protocol: Protocol) -> str:
     """The protocol as the TOML that `rig.protocol.protocol.load_protocol` reads."""
     lines = [f'title = "{protocol.title}"']
     for step in protocol.step:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
     from rig.analysis.proposal import Proposal
+    from rig.analysis.relax_proposal import RelaxProposal
 
 
 @click.command("plan")
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 def command(scene: Path, time: str, fit: Path | None, terms: int, out: Path | None) -> None:
     """Propose where to hold the film of SCENE, and how long, to learn most about it in the given time.
 
+    For a film with branches, by the scene or by --fit, it proposes quick moves with holds.
     Compares what the protocol is expected to tell with the uniform sweep in the same time. Touches no hardware.
     """
     from rig.analysis.fit_file import read_fit
@@ -33,12 +35,61 @@ def command(scene: Path, time: str, fit: Path | None, terms: int, out: Path | No
     from rig.scene.scene import load_scene
 
     check_new(out)
-    film = None if fit is None else read_fit(fit, load_scene(scene)[0].specimen.specimen().material).material
+    believed = load_scene(scene)[0].specimen.specimen().material
+    film = None if fit is None else read_fit(fit, believed).material
+    if (film or believed).branches:
+        from rig.analysis.relax_proposal import propose_relaxation
+
+        relaxing = propose_relaxation(scene, parse_time(time), film)
+        if out is not None:
+            write_text(out, relaxing.text)
+        show(relaxation_table(relaxing))
+        tell_written(out)
+        return
     found = propose_protocol(scene, parse_time(time), film, terms=terms)
     if out is not None:
         write_text(out, found.text)
     show(proposal_table(found))
     tell_written(out)
+
+
+def relaxation_table(found: RelaxProposal) -> Group:
+    """Moves and holds of the planned protocol, and what it is expected to tell of the film and its branches."""
+    from rich.console import Group
+    from rich.table import Table
+
+    from rig.cli.show import NAMES, minutes
+
+    steps = Table(title=found.planned.protocol.title)
+    for heading in ("voltage / V", "speed / mm/s", "hold / s", "held at / mm"):
+        steps.add_column(heading, justify="right")
+    voltage = 0.0
+    for step in found.planned.protocol.step:
+        values = step.model_dump()
+        if step.kind == "voltage":
+            voltage = values["voltage_V"]
+        elif step.kind == "relax":
+            held = ", ".join(f"{one:g}" for one in values["displacements_mm"])
+            steps.add_row(f"{voltage:g}", f"{values['speed_mm_per_s']:g}", f"{values['hold_s']:.1f}", held)
+    table = Table(title="Expected relative standard uncertainty by noise and zeros, %")
+    for heading in ("quantity", "planned", "uniform sweep"):
+        table.add_column(heading, justify="left" if heading == "quantity" else "right")
+    names = {}
+    for k, one in enumerate(found.film.branches, start=1):
+        names |= {
+            f"ratio{k}": f"ratio of the branch of {one.time:g} s",
+            f"time{k}": f"time of the branch of {one.time:g} s",
+        }
+    for name, value in found.planned.expected.items():
+        label = names.get(name) or NAMES.get(name, name)
+        table.add_row(label, f"{100 * value:.2g}", f"{100 * found.sweep.expected[name]:.2g}")
+    return Group(
+        steps,
+        table,
+        f"planned {minutes(found.planned.duration)}, sweep {minutes(found.sweep.duration)}, homing to return. Holds "
+        "tell slow branches, quick moves the fast ones; the stiffness is that of the relaxed film. Fit it with "
+        "`dea-rig fit --branches auto`.",
+    )
 
 
 def proposal_table(found: Proposal) -> Group:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calibration.film.branches.joint import Joint
 from calibration.film.branches.record import Record
+from calibration.film.branches.result import BranchCount, FoundBranch, Spectrum, Trace
 from calibration.film.branches.spectrum import FAR, USUAL, Count, Unseen, count_branches, covariance, misfit, unseen
 from calibration.film.curve import Curve
 from calibration.film.differences import DIMENSIONS
@@ -32,17 +33,7 @@ from calibration.film.propagation import (
     secant_modulus,
     shear_slopes,
 )
-from calibration.film.result import (
-    BranchCount,
-    FoundBranch,
-    Identification,
-    Quantity,
-    RigParameter,
-    Spectrum,
-    Suspect,
-    Trace,
-    verdict,
-)
+from calibration.film.result import Identification, Quantity, RigParameter, Suspect, verdict
 from calibration.film.summary import doubted
 from calibration.film.suspects.viscous import NAME, REMEDY
 from model.material.law import stack

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from calibration.report import relaxation_figure as figures
 from calibration.report.sections.base import ReportData, Section, Table, picture
 from calibration.rounding import rounded, stated
 
@@ -14,8 +15,6 @@ def context(data: ReportData) -> Mapping[str, Any] | None:
     spectrum = data.identification.spectrum
     if spectrum is None:
         return None
-    from calibration.report import relaxation_figure as figures
-
     rows = []
     for one in spectrum.branches:
         ratio, error = rounded(one.ratio, one.ratio_uncertainty)

@@ -12,9 +12,10 @@ import pytest
 from calibration.film.branches.identify import identify_branches
 from calibration.film.branches.record import Record
 from calibration.film.branches.response import Motion
+from calibration.film.branches.result import FoundBranch, Spectrum
 from calibration.film.curve import Curve
 from calibration.film.identify import identify
-from calibration.film.result import GOOD, FoundBranch, Identification, Quantity, Spectrum
+from calibration.film.result import GOOD, Identification, Quantity
 from model.material.materials import NAMED
 from model.specimen import Specimen
 from tests.calibration.film.independent import secant_modulus

@@ -9,7 +9,7 @@ import pytest
 
 from calibration.film.cards import BULK, PROGRAMS, CardError, material_cards, without_card
 from model.material.gent import Gent
-from model.material.materials import EPSILON_0, Material
+from model.material.materials import EPSILON_0, Branch, Material
 from model.material.mooney_rivlin import MooneyRivlin
 from model.material.neo_hooke import NeoHooke
 from model.material.ogden import Ogden
@@ -187,3 +187,77 @@ def test_what_no_program_has_is_refused_by_its_name() -> None:
         material_cards(Material("x", (5e4,), (), 3.0, law=Own))
     many = Material("many", (1e3,) * 7, (2.0,) * 7, 3.0)
     assert without_card(many) == ["FEBio's Ogden material has 6 terms at most, and this one has 7"]
+
+
+def relaxation_abaqus(text: str, time: float) -> float:
+    """G(t): the law's moduli are long-term ones, g over the instantaneous modulus (g, k, tau a line)."""
+    lines = text.splitlines()
+    assert any(line.startswith("*HYPERELASTIC") and line.endswith("MODULI=LONG TERM") for line in lines)
+    first = lines.index("*VISCOELASTIC, TIME=PRONY") + 1
+    series = [[float(one) for one in line.split(",")] for line in lines[first : lines.index("*DIELECTRIC")]]
+    plain = without(text.replace(", MODULI=LONG TERM", ""), "*VISCOELASTIC", 1 + len(series))
+    instant = small_modulus(READERS["film_abaqus.inp"](plain)[0]) / (1.0 - sum(g for g, _, _ in series))
+    return instant * (1.0 - sum(g * (1.0 - np.exp(-time / tau)) for g, _, tau in series))
+
+
+def relaxation_ansys(text: str, time: float) -> float:
+    """G(t): the law's moduli are instantaneous ones, alpha over them (alpha, tau)."""
+    part = text.split("TB,PRONY,1,1,")[1].splitlines()
+    count = int(part[0].split(",")[0])
+    series = [[float(one) for one in line.split(",")[2:4]] for line in part[1 : 1 + count]]
+    instant = small_modulus(READERS["film_ansys.mac"](without(text, "TB,PRONY", count + 1))[0])
+    return instant * (1.0 - sum(a * (1.0 - np.exp(-time / tau)) for a, tau in series))
+
+
+def relaxation_comsol(text: str, time: float) -> float:
+    """G(t): energy factors over the main branch."""
+    values = dict(re.findall(r"^((?:beta|tau)_v\d) ([0-9.e+-]+)", text, re.MULTILINE))
+    series = [(float(values[f"beta_v{k}"]), float(values[f"tau_v{k}"])) for k in (1, 2)]
+    plain = "\n".join(line for line in text.splitlines() if "_v" not in line.split(" ")[0])
+    modulus = small_modulus(READERS["film_comsol.txt"](plain)[0])
+    return modulus * (1.0 + sum(factor * np.exp(-time / tau) for factor, tau in series))
+
+
+def relaxation_febio(text: str, time: float) -> float:
+    """G(t) = G_elastic (g0 + sum g exp(-t/tau))."""
+    found = ElementTree.fromstring(text)
+    assert found.get("type") == "uncoupled viscoelastic"
+    number = {child.tag: float(child.text or "nan") for child in found if child.tag != "elastic"}
+    elastic = found.find("elastic")
+    assert elastic is not None
+    elastic.tag = "material"
+    modulus = small_modulus(READERS["film_febio.xml"](ElementTree.tostring(elastic, encoding="unicode"))[0])
+    decay = sum(number[f"g{k}"] * np.exp(-time / number[f"t{k}"]) for k in (1, 2))
+    return modulus * (number["g0"] + decay)
+
+
+def without(text: str, beginning: str, count: int) -> str:
+    lines = text.splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith(beginning))
+    return "\n".join(lines[:first] + lines[first + count :])
+
+
+def small_modulus(energy: Energy) -> float:
+    """Shear modulus at small strain: W = 2 G e^2 with stretches exp(e) and exp(-e)."""
+    e = 1e-3
+    return (energy(np.exp(e), np.exp(-e)) + energy(np.exp(-e), np.exp(e))) / (4.0 * e * e)
+
+
+RELAXATIONS = {
+    "film_abaqus.inp": relaxation_abaqus,
+    "film_ansys.mac": relaxation_ansys,
+    "film_comsol.txt": relaxation_comsol,
+    "film_febio.xml": relaxation_febio,
+}
+
+
+@pytest.mark.parametrize("card", RELAXATIONS)
+def test_the_prony_series_of_a_card_is_the_films_in_the_programs_own_convention(card: str) -> None:
+    branches = (Branch(0.5, 2.0), Branch(0.25, 40.0))
+    film = Material("viscous", (5e3, 3.5e4), (2.5, 5.6), 2.8, branches=branches)
+    text = material_cards(film)[card]
+    for time in (0.0, 1.0, 10.0, 100.0, 1e4):
+        wanted = film.shear_modulus * (1.0 + sum(one.ratio * np.exp(-time / one.time) for one in branches))
+        assert RELAXATIONS[card](text, time) == pytest.approx(wanted, rel=1e-4), time
+    assert "branches:" in text
+    assert "rest" in text

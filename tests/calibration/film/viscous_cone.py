@@ -176,5 +176,6 @@ class Trace:
 
     def at(self, times: Array) -> Array:
         """Force at other times, by interpolation."""
-        found: Array = PchipInterpolator(self.t, self.force)(times)
+        with np.errstate(over="ignore"):  # slopes of a force that rests at zero
+            found: Array = PchipInterpolator(self.t, self.force)(times)
         return found

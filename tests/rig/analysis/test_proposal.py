@@ -48,7 +48,7 @@ def test_samples_that_stand_for_many_have_less_noise_of_either_sensor(monkeypatc
     certificates = certificates_of(scene, SCENE)
     certificates["force"] = replace(certificates["force"], noise=1e-4)
     film = scene.specimen.specimen().with_material(ONE_TERM)
-    sweep = proposal._sweep(scene, certificates, 300.0, 12e-3, 1500.0)
+    sweep = proposal.uniform_sweep(scene, certificates, 300.0, 12e-3, 1500.0)
     noise = []
     for most in (10_000, 500):
         monkeypatch.setattr(proposal, "MOST_SAMPLES", most)

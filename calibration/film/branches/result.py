@@ -1,0 +1,136 @@
+"""What a fit says about the branches of a film."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.film.result import Quantity, finite, quantity_dict
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FoundBranch:
+    """A Maxwell branch: ratio (over the relaxed film) and time (s) with standard uncertainties; the time's is relative.
+
+    ``verdict`` is "identified", "bounded" or "outside the window". ``ratios`` and ``times`` (s) are 95 % limits.
+    """
+
+    ratio: float
+    ratio_uncertainty: float
+    time: float
+    time_relative: float
+    verdict: str
+    ratios: tuple[float, float]
+    times: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class BranchCount:
+    """A number of branches: AICc over the least of all, and what was left out over its noise (near 1: predicted)."""
+
+    branches: int
+    aicc: float
+    held_out: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One run over time: mean forces (N) that were fitted, their deviations, and the model with and without branches.
+
+    ``segment`` numbers the stretches between bends of the history, of which ``moving`` says where the disk moved.
+    """
+
+    run: str
+    time: Array
+    h: Array
+    voltage: Array
+    measured: Array
+    deviation: Array
+    model: Array
+    relaxed: Array
+    segment: NDArray[np.intp]
+    moving: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """What a record tells of a film's branches.
+
+    Attributes
+    ----------
+    branches : tuple of FoundBranch
+        From the quickest on.
+    window : (float, float)
+        Relaxation times (s) that the record can show: two samples, and its length.
+    instant : Quantity
+        Stiffness of the film with all its branches against a quick move from rest (Pa), at the stretches of
+        ``stiffness_fixed``, which is the relaxed one.
+    counts : tuple of BranchCount
+        The numbers of branches that were tried.
+    slow : float
+        A relaxation time (s) from which on a branch of a usual size would look like stiffness.
+    hold : float
+        How long the film has to be held to see that one (s).
+    quick : float
+        A relaxation time (s) below which such a branch would not show either; 0 where there is none.
+    traces : tuple of Trace
+    """
+
+    branches: tuple[FoundBranch, ...]
+    window: tuple[float, float]
+    instant: Quantity
+    counts: tuple[BranchCount, ...]
+    slow: float
+    hold: float
+    quick: float
+    traces: tuple[Trace, ...] = ()
+
+    @property
+    def sentences(self) -> list[str]:
+        """For the operator: what was found and what the record cannot show."""
+        words = []
+        for one in self.branches:
+            low, high = one.times
+            words.append(
+                f"branch: ratio {one.ratio:.3g} +- {one.ratio_uncertainty:.1g}, time {one.time:.3g} s (95 %: {low:.3g} "
+                f"to {high:.3g} s): {one.verdict}"
+            )
+        if not self.branches:
+            words.append("no branch is needed to explain this record")
+        words.append(f"a branch of {self.slow:.0f} s would look like stiffness; hold {_minutes(self.hold)} to see it")
+        if self.quick > 0.0:
+            words.append(f"a branch of {self.quick:.2g} s would not show; move faster to see it")
+        return words
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, without the traces."""
+        return {
+            "branches": [
+                {
+                    "ratio": one.ratio,
+                    "ratio_standard_uncertainty": finite(one.ratio_uncertainty),
+                    "time_s": one.time,
+                    "time_relative_standard_uncertainty": finite(one.time_relative),
+                    "ratio_interval_95": [finite(end) for end in one.ratios],
+                    "time_interval_95_s": [finite(end) for end in one.times],
+                    "verdict": one.verdict,
+                }
+                for one in self.branches
+            ],
+            "window_s": list(self.window),
+            "instantaneous_stiffness": quantity_dict(self.instant),
+            "counts": [asdict(one) for one in self.counts],
+            "looks_like_stiffness_from_s": self.slow,
+            "hold_to_see_it_s": self.hold,
+            "does_not_show_below_s": self.quick,
+            "sentences": self.sentences,
+        }
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
