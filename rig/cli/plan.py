@@ -74,7 +74,7 @@ def relaxation_table(found: RelaxProposal) -> Group:
     table = Table(title="Expected relative standard uncertainty by noise and zeros, %")
     for heading in ("quantity", "planned", "uniform sweep"):
         table.add_column(heading, justify="left" if heading == "quantity" else "right")
-    names = {}
+    names: dict[str, str] = {}
     for k, one in enumerate(found.film.branches, start=1):
         names |= {
             f"ratio{k}": f"ratio of the branch of {one.time:g} s",
