@@ -17,13 +17,13 @@ MAY_IMPORT_LATE = {
 }
 # Single ones, from where to where: a scene or a command pays only for what it names.
 LATE = {
-    ("calibration.film.summary", "calibration.film.branches.estimate"): "histories, where a film looks viscous",
     ("drivers.discovery", "drivers.links.can_link"): "python-can, where a bus is asked",
     ("drivers.discovery", "drivers.links.serial_link"): "pyserial, where ports are looked for",
     ("drivers.discovery", "drivers.links.device_server"): "pyserial, where a port is asked",
     ("drivers.settings", "drivers.links.can_link"): "python-can, where an instrument is on a bus",
     ("drivers.settings", "drivers.links.device_server"): "pyserial, where an instrument is on a port",
     ("drivers.settings", "drivers.links.tcp_link"): "sockets, where an instrument is on the network",
+    ("rig.analysis.film", "calibration.film.branches.estimate"): "histories, where a film looks viscous",
     ("rig.analysis.film", "calibration.film.branches.identify"): "histories, with --branches",
     ("rig.analysis.film", "calibration.film.branches.record"): "histories, with --branches",
     ("rig.analysis.film", "calibration.film.posterior"): "emcee, with --posterior",

@@ -127,7 +127,6 @@ def summarise(
         provenance=provenance,
         assumed=assumed_parts(used_curves),
         measurement=most_useful(quantities, used_curves),
-        elastic_error=_elastic_error(doubts, problem, problem.film(x), held),
     )
     if misfit > WRONG_MODEL:
         lost = {
@@ -144,30 +143,23 @@ def summarise(
             *notes,
         ]
         result = replace(result, quantities=lost)
-    if result.elastic_error:
+    if looks_viscous(doubts):
         result = replace(result, quantities={name: _viscous(one) for name, one in result.quantities.items()})
     return replace(result, warnings=[*_warnings(result, problem, fit), *notes])
 
 
-def _elastic_error(
-    doubts: Sequence[Suspect], problem: Problem, film: Material, held: Mapping[str, float]
-) -> dict[str, float]:
-    """By how much (relative) results are off by a viscosity that shows and was not fitted; empty where none does.
+def looks_viscous(found: Sequence[Suspect]) -> bool:
+    """Whether residuals look like a film that takes time.
 
     Other imperfections that cost energy look like it in part: it counts where it explains half as much as the best.
     """
-    able = [one for one in doubts if one.possible and math.isfinite(one.uncertainty)]
+    able = [one for one in found if one.possible and math.isfinite(one.uncertainty)]
 
     def explains(one: Suspect) -> float:
         return (one.amplitude / one.uncertainty) ** 2
 
     viscous = [explains(one) for one in able if one.family == VISCOUS and one.significant]
-    if not viscous or max(viscous) < 0.5 * max(explains(one) for one in able):
-        return {}
-    from calibration.film.branches.estimate import error_of_elastic_fit
-
-    used = [problem.curves[i] for i in dict.fromkeys(problem.active)]
-    return error_of_elastic_fit(used, film, held)
+    return bool(viscous) and max(viscous) >= 0.5 * max(explains(one) for one in able)
 
 
 def _viscous(quantity: Quantity) -> Quantity:
@@ -306,11 +298,9 @@ def _warnings(result: Identification, problem: Problem, fit: Fit) -> list[str]:
         keys = [key for key in dict.fromkeys(by_name[name].key for name in result.likely) if key]
         if keys:
             words.append(f"it can be fitted along: --along {' or --along '.join(keys)}")
-    if result.elastic_error:
-        shifts = " and ".join(f"{name} by about {100.0 * one:+.2g} %" for name, one in result.elastic_error.items())
+    if looks_viscous(result.suspects):
         words.append(
-            f"the film takes time (viscous) and was fitted as elastic, which shifts {shifts} (estimate of first "
-            "order); --branches auto fits its relaxation along"
+            "the film takes time (viscous) and was fitted as elastic; --branches auto fits its relaxation along"
         )
     if problem.excess > 1.0:
         words.append(

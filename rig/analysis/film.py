@@ -18,6 +18,7 @@ from calibration.film.cards import CardError, material_cards
 from calibration.film.curve import Curve, CurveError
 from calibration.film.identify import IdentificationError, compare, identify
 from calibration.film.result import Identification
+from calibration.film.summary import looks_viscous
 from calibration.sensors.certificate import Certificate
 from model.material.law import Law
 from model.material.laws import find_law
@@ -184,6 +185,10 @@ def identify_curves(
             identification, curves = _with_branches(curves, records, branches, terms, options)
         else:
             identification = same[0] if same else identify(curves, terms=terms, **options)
+            if looks_viscous(identification.suspects):
+                from calibration.film.branches.estimate import with_elastic_error
+
+                identification = with_elastic_error(identification, curves)
         if posterior:
             from calibration.film.posterior import posterior as sample
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from calibration.film.branches.joint import Joint
 from calibration.film.branches.record import records_of_curves
 from calibration.film.branches.spectrum import guess
 from calibration.film.curve import Curve
+from calibration.film.result import Identification
 from model.material.materials import Material
 
 MOST = 2  # branches that are tried
@@ -33,3 +35,13 @@ def error_of_elastic_fit(curves: Sequence[Curve], film: Material, held: Collecti
                 found["eps_r"] = film.eps_r / there.eps_r - 1.0
             return {name: one for name, one in found.items() if math.isfinite(one)}
     return {}
+
+
+def with_elastic_error(found: Identification, curves: Sequence[Curve]) -> Identification:
+    """The result of an elastic fit of data that look like a film that takes time, with by how much it is off."""
+    off = error_of_elastic_fit(curves, found.material, found.provenance.get("settings", {}).get("fixed", ()))
+    if not off:
+        return found
+    shifts = " and ".join(f"{name} by about {100.0 * one:+.2g} %" for name, one in off.items())
+    words = f"fitted as elastic the result is off: {shifts} (estimate of first order)"
+    return replace(found, elastic_error=off, warnings=[*found.warnings, words])

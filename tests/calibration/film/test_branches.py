@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from calibration.film.branches.estimate import with_elastic_error
 from calibration.film.branches.identify import identify_branches
 from calibration.film.branches.record import Record
 from calibration.film.branches.response import Motion
@@ -116,6 +117,7 @@ def relaxed_stiffness(cone: ViscousCone, found: Identification) -> float:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_papers_sweep_of_a_viscous_film() -> None:
     """Fitted as elastic it is a few per cent off and good-looking, and says so; with branches the truth is covered."""
     cone = ViscousCone(branches=BRANCHES, **ONE_TERM)
@@ -125,7 +127,7 @@ def test_the_papers_sweep_of_a_viscous_film() -> None:
     residual = max(one.rms_residual for one in elastic.curves) / float(max(c.force.max() for c in curves))
     assert 0.01 < off < 0.06
     assert residual < 0.006
-    assert elastic.elastic_error["eps_r"] == pytest.approx(off, abs=0.6 * off)
+    assert with_elastic_error(elastic, curves).elastic_error["eps_r"] == pytest.approx(off, abs=0.6 * off)
     for name in ("eps_r", "stiffness", "stiffness_fixed"):
         assert elastic.quantities[name].verdict != GOOD
         assert "viscous" in elastic.quantities[name].doubt
