@@ -1,8 +1,9 @@
-"""Rates over real serial ports: does every sample arrive, and what part of a processor core does that take?
+"""Rates over real ports: does every sample arrive, and what part of a processor core does that take?
 
 The simulated bench runs in a process of its own behind pseudo-terminals, with the force amplifier at 1 kHz, the stage
 polled at 50 Hz and the laser at 100 Hz. First only the three serial drivers are polled, in the engine's manner; then
-a whole run with high voltage and log. POSIX only.
+load cell, laser and a probe on one LabJack and a meter, over TCP, beside the stage; then a whole run with high voltage
+and log. POSIX only.
 
 Lost samples are counted by their noise. What the simulated amplifier adds to its n-th frame follows from the scene's
 seed, so that every reading tells which frame it is, and no clock is needed to see that one is missing.
@@ -16,7 +17,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from importlib.resources import files
@@ -56,7 +57,16 @@ Progress = Callable[[float, str], None]  # share done, what is being done
 FORCE_HZ, STAGE_HZ, LASER_HZ = 1000.0, 50.0, 100.0
 ALLOWED_SHARE = 0.25  # of a core, for the host
 DRIVERS, WHOLE_RUN = "three serial drivers", "whole run with high voltage and log"
-RUN_SHARE = 0.4  # of the progress bar
+NETWORK = "a LabJack with three sensors, and a meter, over TCP"
+RUN_SHARE, NETWORK_SHARE = 0.4, 0.25  # of the progress bar
+NETWORK_HZ = {"stage": STAGE_HZ, "force": 100.0, "displacement": 100.0, "monitor": 10.0, "monitor_2": 5.0}
+NETWORK_CHANGES = {
+    "approach_from_mm = 36.0": "approach_from_mm = 36.0\ntimeout_s = 2.0",
+    "rate_Hz = 100.0": "rate_Hz = 100.0\ntimeout_s = 2.0",
+    "mm_per_V = 4.0": "rate_Hz = 100.0\ntimeout_s = 2.0\nmm_per_V = 4.0",
+    "[simulation]\n": '[monitor]\ndriver = "labjack-monitor"\nquantity = "temperature"\nrate_Hz = 10.0\n'
+    'timeout_s = 2.0\n\n[monitor_2]\ndriver = "scpi"\nquantity = "humidity"\nrate_Hz = 5.0\n\n[simulation]\n',
+}
 
 # From the scene of the examples to this one. Short ways; and time-outs with patience, they are not what is measured.
 CHANGES = {
@@ -133,17 +143,23 @@ def measure(
     seconds: float,
     *,
     full: bool = False,
+    network: bool = True,
     whole_run: bool = True,
     progress: Progress = lambda share, what: None,
 ) -> Report:
-    """Poll for ``seconds``; with ``whole_run``, carry out the short protocol too."""
+    """Poll for ``seconds``; over TCP too with ``network``; with ``whole_run``, carry out the short protocol."""
     with TemporaryDirectory(prefix="dea-rig-rates-") as name:
         folder = Path(name)
         path = folder / "scene.toml"
         path.write_text(scene_text(), encoding="utf-8")
         load_before = _load()
+        on_tcp = folder / "network.toml"
+        on_tcp.write_text(scene_text("analogue-amplifier", NETWORK_CHANGES), encoding="utf-8")
         share = 1.0 - RUN_SHARE if whole_run else 1.0
-        rows = [_drivers(path, seconds, lambda done: progress(share * done, DRIVERS))]
+        first = share * (1.0 - NETWORK_SHARE)
+        rows = [_drivers(path, seconds, lambda done: progress(first * done, DRIVERS))]
+        if network:
+            rows.append(_network(on_tcp, seconds, lambda done: progress(first + (share - first) * done, NETWORK)))
         if whole_run:
             rows.append(_whole_run(path, folder, lambda done: progress(share + RUN_SHARE * done, WHOLE_RUN)))
     environment = {
@@ -175,21 +191,34 @@ def save(report: Report, out_dir: Path) -> None:
     _draw(report, out_dir / "rates.png")
 
 
-# ---- the two ways of working
+# ---- the ways of working
 
 
-def scene_text() -> str:
+def scene_text(name: str = "cone-4mm", changes: Mapping[str, str] = CHANGES) -> str:
     """The scene: that of the examples with a disk of 4 mm, at these rates."""
     fixtures = Path(str(files("sim_fixtures")))
-    text = (fixtures / "scenes" / "cone-4mm.toml").read_text(encoding="utf-8")
-    for old, new in (CHANGES | {"../calibrations": (fixtures / "calibrations").as_posix()}).items():
+    text = (fixtures / "scenes" / f"{name}.toml").read_text(encoding="utf-8")
+    for old, new in ({**changes} | {"../calibrations": (fixtures / "calibrations").as_posix()}).items():
         if old not in text:
             raise ValueError(f"the example scene has no {old!r} any more")
         text = text.replace(old, new)
     return text
 
 
-def _drivers(path: Path, seconds: float, progress: Callable[[float], None]) -> Row:
+@dataclass(frozen=True)
+class _Polling:
+    """What came of polling a bench: force readings, and of each role how often it gave a sample."""
+
+    seconds: float
+    host_s: float
+    simulator_s: float
+    readings: list[float]
+    polled: dict[str, Polled]
+    believed_lost: int
+
+
+def _poll(path: Path, seconds: float, rates: Mapping[str, float], progress: Callable[[float], None]) -> _Polling:
+    """Poll the drivers of a scene, without its supply, in the engine's manner."""
     scene, _ = load_scene(path)
     readings: list[float] = []
     counts: dict[str, int] = {}
@@ -216,22 +245,44 @@ def _drivers(path: Path, seconds: float, progress: Callable[[float], None]) -> R
                 progress((clock.now() - begun) / seconds)
         elapsed = clock.now() - begun
         host, there = process_time() - used, _processor_time(simulator) - used_there
-        rates = {"stage": STAGE_HZ, "displacement": LASER_HZ}
-        polled = [
-            _polled(role, wanted, counts.get(role, 0) / elapsed, devices[role], before[role])
+        polled = {
+            role: _polled(role, wanted, counts.get(role, 0) / elapsed, devices[role], before[role])
             for role, wanted in rates.items()
-        ]
-        believed = devices["force"].counters["lost_samples"] - before["force"]["lost_samples"]
+        }
+        lost = "lost_samples" if "lost_samples" in before["force"] else "polls_missed"
+        believed = devices["force"].counters[lost] - before["force"][lost]
+    return _Polling(elapsed, host, there, readings, polled, believed)
+
+
+def _drivers(path: Path, seconds: float, progress: Callable[[float], None]) -> Row:
+    scene, _ = load_scene(path)
+    found = _poll(path, seconds, {"stage": STAGE_HZ, "displacement": LASER_HZ}, progress)
     return Row(
         DRIVERS,
-        elapsed,
-        FORCE_HZ * elapsed,
-        len(readings),
-        count_lost(readings, sent_readings(scene, elapsed + SETUP_LIMIT_S), _noise(scene)),
-        believed,
-        host / elapsed,
-        there / elapsed,
-        polled,
+        found.seconds,
+        FORCE_HZ * found.seconds,
+        len(found.readings),
+        count_lost(found.readings, sent_readings(scene, found.seconds + SETUP_LIMIT_S), _noise(scene)),
+        found.believed_lost,
+        found.host_s / found.seconds,
+        found.simulator_s / found.seconds,
+        list(found.polled.values()),
+    )
+
+
+def _network(path: Path, seconds: float, progress: Callable[[float], None]) -> Row:
+    """Nothing is lost on TCP: a question that could not be asked in time is what is missing."""
+    found = _poll(path, seconds, NETWORK_HZ, progress)
+    return Row(
+        NETWORK,
+        found.seconds,
+        NETWORK_HZ["force"] * found.seconds,
+        len(found.readings),
+        found.polled["force"].missed,
+        found.believed_lost,
+        found.host_s / found.seconds,
+        found.simulator_s / found.seconds,
+        list(found.polled.values()),
     )
 
 
@@ -406,8 +457,9 @@ def render(report: Report) -> RenderableType:
     from rich.table import Table
 
     force = Table(
-        title=f"Force at {FORCE_HZ:.0f} Hz over a pseudo-terminal, stage and laser polled beside it",
-        caption="Lost: counted by the simulator's own noise. Believed lost: room that the time stamps leave. "
+        title=f"Force at {FORCE_HZ:.0f} Hz over a pseudo-terminal, stage and laser polled beside it; and over TCP",
+        caption="Lost: counted by the simulator's own noise; over TCP, questions that could not be asked in time. "
+        "Believed lost: room that the time stamps leave. "
         f"Used/allowed: of {ALLOWED_SHARE:.0%} of a core.",
     )
     for heading in ("", "s", "expected", "received", "lost", "believed lost", "host", "simulator", "used/allowed"):

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from drivers.roles import HVFlag
+from drivers.roles import HVFlag, MonitorSample
 from rig.base.errors import LimitError
 from rig.operator.control import Question
 from rig.safety.limits import Limit
@@ -21,6 +21,7 @@ from rig.steps.rig import Rig
 from rig.steps.standards import check_speed
 from rig.steps.turns import Readings, listening, pause, stand_still
 
+ZERO_C_IN_K = 273.15
 READ_S = 0.5  # over which the sensors are averaged
 MOVE_S = 10.0  # for the estimate: nobody knows yet from where to where
 PATTERN = r"^(home|read|[-+]?\d+(\.\d*)?|[-+]?\.\d+)$"
@@ -139,6 +140,17 @@ def tell_readings(rig: Rig) -> Turns:
         rig.control.say(line)
 
 
+def _monitored(sample: MonitorSample) -> str:
+    """One monitor's value, in the units of the scene."""
+    match sample.quantity:
+        case "voltage":
+            return f"{sample.value:.1f} V, the second reading of the voltage"
+        case "temperature":
+            return f"{sample.value - ZERO_C_IN_K:.2f} C, temperature of the air"
+        case _:
+            return f"{100 * sample.value:.1f} %, relative humidity of the air"
+
+
 def reading_lines(rig: Rig, read: Readings) -> Iterator[str]:
     """Role, value, state and who it is."""
     recorder, stage = rig.recorder, rig.recorder.stage
@@ -153,6 +165,8 @@ def reading_lines(rig: Rig, read: Readings) -> Iterator[str]:
         current = f"{hv.current * 1e6:.2f} uA, " if math.isfinite(hv.current) else ""
         on = "ON" if HVFlag.ON in hv.flags else "off"
         said["hv"] = f"{hv.voltage:.1f} V measured, {current}set-point {hv.setpoint:.0f} V, channel {on}"
+    for monitor in recorder.monitors.values():
+        said[monitor.role] = _monitored(monitor)
     for role, device in rig.bench.devices.items():
         who = device.identity
         name = f"{who.model} {who.serial}".strip()

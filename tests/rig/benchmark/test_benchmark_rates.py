@@ -22,7 +22,7 @@ NOISE = 0.01
 @pytest.fixture(scope="module")
 def report() -> rates.Report:
     shares: list[float] = []
-    found = rates.measure(2.0, whole_run=False, progress=lambda share, what: shares.append(share))
+    found = rates.measure(2.0, network=False, whole_run=False, progress=lambda share, what: shares.append(share))
     assert shares == sorted(shares)
     assert 0 <= shares[0] <= shares[-1] <= 1.05
     return found
@@ -64,7 +64,7 @@ def test_files_and_tables_hold_the_same_numbers(report: rates.Report, tmp_path: 
 @posix
 @pytest.mark.slow
 def test_no_frame_of_some_thousands_is_lost_beside_stage_and_laser() -> None:
-    (row,) = rates.measure(8.0, whole_run=False).rows
+    (row,) = rates.measure(8.0, network=False, whole_run=False).rows
     assert row.lost == 0 and row.seconds >= 8.0
     wanted = {polled.role: polled.wanted_Hz for polled in row.polled}
     assert (rates.FORCE_HZ, wanted) == (1000.0, {"stage": 50.0, "displacement": 100.0})
@@ -73,8 +73,20 @@ def test_no_frame_of_some_thousands_is_lost_beside_stage_and_laser() -> None:
 
 @posix
 @pytest.mark.slow
+def test_a_labjack_and_a_meter_over_tcp_answer_all_that_is_asked() -> None:
+    _, row = rates.measure(3.0, whole_run=False).rows
+    assert row.what == rates.NETWORK and math.isfinite(row.host_share)
+    assert {polled.role: polled.wanted_Hz for polled in row.polled} == rates.NETWORK_HZ
+    for polled in row.polled:
+        assert polled.retries == 0 or polled.round_trip_max_ms > 1000.0, polled
+        assert 0 < polled.round_trip_mean_ms <= polled.round_trip_max_ms
+        assert 0 < polled.reached_Hz <= 1.5 * polled.wanted_Hz
+
+
+@posix
+@pytest.mark.slow
 def test_a_whole_run_loses_nothing() -> None:
-    _, row = rates.measure(1.0).rows
+    _, row = rates.measure(1.0, network=False).rows
     assert row.what == rates.WHOLE_RUN
     assert row.lost == 0
     assert math.isfinite(row.host_share)
