@@ -168,7 +168,7 @@ class Watch:
     def _prove_scale(self) -> None:
         stage, laser = self._recorder.stage, self._recorder.displacement_sample
         if self._recorder.has_laser and stage is not None and laser is not None and stage.moving and not laser.flags:
-            self._scale.sample(stage.position, self._recorder.without_zero(laser))
+            self._scale.sample(stage.t, stage.position, self._recorder.without_zero(laser))
 
     def _compare_stage_and_laser(self, now: float) -> None:
         """Beyond contact the disk goes with the stage; if they part, one of the two sensors does not tell the truth."""

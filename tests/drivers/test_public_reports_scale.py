@@ -126,17 +126,19 @@ def test_an_axis_whose_stage_was_changed_says_what_to_do() -> None:
 # The laser, proven against the stage ----------------------------------------------------------------------------------
 
 
-def seen(ratio: float, *, contact: float = 1.0, way: float = 10e-3) -> None:
-    """What a sensor shows that sees the pusher from position ``contact`` (m) on, over 10 mm at 5 mm/s, 50 ms late."""
+def seen(ratio: float, *, contact: float = 1.0, way: float = 10e-3, speed: float = 4e-3) -> None:
+    """What a sensor shows that sees the pusher from position ``contact`` (m) on, 50 ms late and up to 20 ms old."""
     scale = LaserScale()
-    for k in range(round(way / 5e-3 * 100)):
-        stage = 5e-3 * 0.01 * k
-        scale.sample(stage, ratio * max(stage - 2.5e-4 - contact, 0.0) + 1e-3)
+    for k in range(round(way / speed * 50)):
+        t = 0.02 * k
+        old = 0.07 if k % 7 else 0.03
+        scale.sample(t, speed * t, ratio * max(speed * (t - old) - contact, 0.0) + 1e-3)
 
 
+@pytest.mark.parametrize("speed", [0.5e-3, 4e-3, 50e-3])
 @pytest.mark.parametrize("ratio", [1.0, -1.0, 0.97, 1.1])
-def test_a_laser_that_goes_with_the_stage_is_right(ratio: float) -> None:
-    seen(ratio, contact=0.0)
+def test_a_laser_that_goes_with_the_stage_is_right(ratio: float, speed: float) -> None:
+    seen(ratio, contact=0.0, speed=speed, way=50 * speed if speed > 1e-2 else 10e-3)
 
 
 @pytest.mark.parametrize("contact", [2e-3, 4.7e-3, 5.3e-3, 8e-3])
@@ -152,11 +154,11 @@ def test_a_laser_that_sees_the_disk_proves_nothing_before_contact_and_after(cont
         (1 / 25.4, "display is in inches"),
         (0.1, "decimal point"),
         (10.0, "decimal point"),
-        (1.5, "1.5 times as much. The unit or scale of one of the two is wrong. Correct"),
+        (127 / 31.75, "times as much. The unit or scale of one of the two is wrong. Correct"),
     ],
 )
 def test_a_laser_in_another_unit_is_refused_before_the_film_is_met(ratio: float, words: str) -> None:
     if ratio < 0.05:
         ratio = -ratio  # counting the other way is a matter of its own
     with pytest.raises(FaultError, match=words):
-        seen(ratio, contact=0.0, way=4e-3)
+        seen(ratio, contact=0.0, way=6e-3)

@@ -345,11 +345,11 @@ def test_two_stages_with_one_address_are_refused_before_anything_moves(serial: i
 
 @pytest.mark.slow
 def test_a_laser_in_another_unit_ends_the_run_before_the_film_is_met(tell: Any) -> None:
-    """One that sees the pusher, and shows 1.9 mm for each."""
+    """One that sees the pusher, and shows 4 mm for each."""
 
     def sees_the_pusher(now: float, bench: SimulatedBench, control: Any) -> None:
         bench.world.fixture = "target"
 
-    story = tell(meanwhile=sees_the_pusher, replace=("gain_error = -3e-4", "gain_error = 0.9"))
-    assert "1.9 times as much" in str(story.error) and "The film was not met yet" in str(story.error), story.error
+    story = tell(meanwhile=sees_the_pusher, replace=("gain_error = -3e-4", "gain_error = 3.0"))
+    assert "times as much" in str(story.error) and "The film was not met yet" in str(story.error), story.error
     assert story.bench.world.indentation_at(story.end) == 0.0
