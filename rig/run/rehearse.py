@@ -18,9 +18,11 @@ from rig.log.writer import SPARSE_CHUNK_SECONDS, LogWriter
 from rig.operator.control import Control
 from rig.protocol.experiment import Experiment, gains_of
 from rig.run.backend import open_bench
+from rig.steps.base import Action
 
 REHEARSED_S, REHEARSED_M_PER_S = 4.0, 1e-3
 REHEARSED_CHUNKS = 30
+SCATTER = 1e-3  # relative, of what is summed up from cycle to cycle: what of a number no compression shortens
 
 
 def check_instruments(experiment: Experiment) -> None:
@@ -51,7 +53,7 @@ def log_size(experiment: Experiment) -> int | None:
     size = experiment.kept_s * _bytes_per_second(experiment)
     for action in experiment.actions:
         if action.summaries:
-            size += action.summaries * _bytes_per_summary(action.duration / action.summaries)
+            size += action.summaries * _bytes_per_summary(experiment, action)
     return round(size)
 
 
@@ -70,24 +72,37 @@ def _bytes_per_second(experiment: Experiment) -> float:
             return (log.size - before) / (bench.clock.now() - begun)
 
 
-def _bytes_per_summary(period: float) -> float:
-    """By as many as are written, a chunk at a time, with numbers that no compression shortens."""
+def _bytes_per_summary(experiment: Experiment, action: Action) -> float:
+    """By as many as are written, a chunk at a time, with numbers that scatter and those left out that are not there."""
     sizes: list[int] = []
     container = ContainerWriter(lambda data: sizes.append(len(data)))
     channel = container.add_channel("/cycle", schema.schema_name("/cycle"), schema.schema_data("/cycle"))
-    rng, fields = random.Random(1), schema.CHANNELS["/cycle"].fields
+    rng, period = random.Random(1), action.duration / action.summaries
+    doubles = [f.name for f in schema.CHANNELS["/cycle"].fields if f.type == "double"]
     a_chunk = max(math.ceil(SPARSE_CHUNK_SECONDS / period), 1)
     before, count = sum(sizes), 0
     for _ in range(REHEARSED_CHUNKS):
         for _ in range(a_chunk):
             count += 1
-            t = round(count * period * 1e9)
-            row = {f.name: rng.random() if f.type == "double" else f.type == "bool" and count for f in fields}
-            row |= {"cycle": count, "step": 4, "samples": 100, "whole": True, "kept": False}
-            container.add_message(channel, schema.encode("/cycle", row), t, t)
+            t = count * period
+            row: dict[str, float | int | bool] = {name: 0.1 * (1.0 + SCATTER * rng.gauss()) for name in doubles}
+            row |= dict.fromkeys(_not_measured(experiment, action), math.nan)
+            row |= {"t_s": t, "begin_s": t - period, "cycle": count, "step": action.step, "samples": 100}
+            row |= {"whole": True, "kept": False}
+            container.add_message(channel, schema.encode("/cycle", row), round(t * 1e9), round(t * 1e9))
         container.end_chunk()
-    container.finish()
-    return (sum(sizes) - before) / count
+    return (container.size - before) / count
+
+
+def _not_measured(experiment: Experiment, action: Action) -> list[str]:
+    """Fields of a summary that have no value on this bench."""
+    hv = experiment.scene.hv
+    names = ["actuation_N_per_V2"] if action.moves else ["stiffness_N_per_m"]
+    if hv is None:
+        names += ["voltage_valley_V", "voltage_peak_V"]
+    if hv is None or not hv.measures_current:
+        names += ["current_valley_A", "current_peak_A", "electric_J", "leakage_A"]
+    return names
 
 
 def _can_be_rehearsed(experiment: Experiment) -> bool:

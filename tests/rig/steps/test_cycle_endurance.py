@@ -40,7 +40,7 @@ from tests.rig.steps.test_keys_of_steps import SCENES
 
 WEEK_S = 7 * 86_400.0
 PERIOD_S = WEEK_S / 1e6
-TURNS = 8  # of the stand-in's loop, in a cycle
+TURNS = 10  # of the stand-in's loop, in a cycle
 CONTACT_M, LOW_M, HIGH_M = 40e-3, 1e-3, 1.4e-3
 NO_FLAGS = SampleFlag(0)
 
