@@ -18,14 +18,15 @@ HALF_DAY = 0.5 * DAY
 
 def column_values(cells: Sequence[str], dialect: Dialect) -> tuple[Array, list[int]]:
     """Numbers of a column, nan for empty cells; and the rows whose cell is neither empty nor a finite number."""
-    try:
-        if dialect.decimal == ".":
-            # The fast road; float() also takes "1_0" and "nan", which are looked for apart.
-            values = np.array(cells, dtype=np.float64)
-            if np.isfinite(values).all() and "_" not in "".join(cells):
-                return values, []
-    except ValueError:
-        pass
+    text = "\n".join(cells)
+    # The fast road; float() also takes "1_0" and "nan", which are looked for apart, and a point may part thousands.
+    if "_" not in text and not (dialect.decimal == "," and "." in text):
+        try:
+            values = np.array(text.replace(",", ".").split("\n") if dialect.decimal == "," else cells, dtype=np.float64)
+        except ValueError:
+            values = np.full(len(cells), np.nan)
+        if len(values) == len(cells) and np.isfinite(values).all():
+            return values, []
     values = np.full(len(cells), np.nan)
     bad = []
     for row, cell in enumerate(cells):

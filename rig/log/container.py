@@ -185,18 +185,21 @@ class ContainerWriter:
             (Opcode.ATTACHMENT_INDEX, map(_record, self._attachment_indexes)),
             (Opcode.METADATA_INDEX, map(_record, self._metadata_indexes)),
         ]
-        offsets, crc = b"", 0
+        offsets, crc, waiting = b"", 0, b""
         for opcode, records in groups:
-            begun = self._offset
+            begun = self._offset + len(waiting)
             for data in records:
-                self._put(data)
+                waiting += data
                 crc = zlib.crc32(data, crc)
-            if self._offset > begun:
-                offsets += _record(SummaryOffset(opcode, begun, self._offset - begun))
-        offsets_start = self._offset
+                if len(waiting) > INDEX_IN_MEMORY:  # few writes, and little memory
+                    self._put(waiting)
+                    waiting = b""
+            if size := self._offset + len(waiting) - begun:
+                offsets += _record(SummaryOffset(opcode, begun, size))
+        offsets_start = self._offset + len(waiting)
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offsets_start)
         crc = zlib.crc32(footer, zlib.crc32(offsets, crc))
-        self._put(offsets + _record(Footer(start, offsets_start, crc)) + MAGIC)
+        self._put(waiting + offsets + _record(Footer(start, offsets_start, crc)) + MAGIC)
 
     def _statistics(self) -> Statistics:
         return Statistics(

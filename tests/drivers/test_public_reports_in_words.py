@@ -40,7 +40,13 @@ class Stage:
     def write(self, data: bytes) -> None:
         device, axis, number, *words = data.decode()[1:].partition(":")[0].split()
         flags = self.flags.split()
-        values = {"get resolution": "64", "get limit.max": "305381", "get maxspeed": "1000", "get accel": "100"}
+        values = {
+            "get deviceid": "50081",
+            "get resolution": "64",
+            "get limit.max": "305381",
+            "get maxspeed": "1000",
+            "get accel": "100",
+        }
         value = f"{len(flags):02d} {self.flags}".strip() if words == ["warnings"] else values.get(" ".join(words), "0")
         text = f"{int(device):02d} {axis} {int(number):02d} OK IDLE {flags[0] if flags else '--'} {value}".encode()
         self.out += b"@" + text + b":%02X\r\n" % checksum(text)

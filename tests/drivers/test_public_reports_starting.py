@@ -145,7 +145,13 @@ def stage(data: bytes) -> bytes:
     replies = b""
     for line in data.splitlines():
         device, axis, number, *words = line.decode()[1:].partition(":")[0].split()
-        values = {"get resolution": "64", "get limit.max": "305381", "get maxspeed": "1000", "warnings": "00"}
+        values = {
+            "get deviceid": "50081",
+            "get resolution": "64",
+            "get limit.max": "305381",
+            "get maxspeed": "1000",
+            "warnings": "00",
+        }
         text = f"{int(device):02d} {axis} {number} OK IDLE -- {values.get(' '.join(words), '0')}"
         replies += f"@{text}:{-sum(text.encode()) & 0xFF:02X}\r\n".encode()
     return replies

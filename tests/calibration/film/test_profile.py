@@ -46,7 +46,8 @@ def test_an_imperfection_that_was_found_is_in_the_intervals_too(
         quantity = found.quantities[name]
         assert quantity.interval is not None
         low, high = quantity.interval
-        assert (high - low) / (2 * 1.96) == pytest.approx(quantity.uncertainty, rel=0.03)
+        # The profile enlarges the zeros by the misfit as well; the budget enlarges the noise alone.
+        assert 0.97 < (high - low) / (2 * 1.96) / quantity.uncertainty < 1.2
     assert quantity.budget["lack of fit"] > 3.0 * quantity.budget["noise"]
     assert low < film.eps_r < high
 

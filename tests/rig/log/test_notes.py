@@ -112,7 +112,11 @@ def test_reports_name_session_and_notes_of_the_logs_that_have_any(small: Path, t
         log.attach("scene.toml", "application/toml", b'[session]\noperator = "M. Curie"\n')
         log.finish({"status": "complete"})
     logs = [read_log(small), read_log(tmp_path / "a.mcap")]
-    assert said_in(logs) == {"session": {str(logs[1].path): {"operator": "M. Curie"}}}
+    assert said_in(logs[1:]) == {"session": {str(logs[1].path): {"operator": "M. Curie"}}}
+    assert set(said_in(logs)["session"][str(small)]) == {
+        "measured_temperature_C",
+        "measured_humidity_percent",
+    }  # one message of every kind is in it
     add_note(small, "A scratch.", "Noether")
     said = said_in(logs)
     assert list(said) == ["session", "notes"] and list(said["notes"]) == [str(small)]
