@@ -74,11 +74,12 @@ def test_a_wrong_model_that_biases_the_permittivity_is_found_out(
 
 
 @pytest.mark.parametrize(
+    # The hereditary film of `relaxed` is as strong as a branch 2.8 times its ratio at rest in the pre-stretched film.
     ("suspect", "ratio", "tau"),
     [
         ("compliance of the rig", 0.0, 1.0),
-        ("relaxation time near 3 s", 1.0, 3.0),
-        ("relaxation time near 30 s", 1.0, 30.0),
+        ("relaxation time near 3 s", 0.35, 3.0),
+        ("relaxation time near 30 s", 0.37, 30.0),
     ],
 )
 def test_what_does_not_show_is_stated_with_the_harm_it_does(

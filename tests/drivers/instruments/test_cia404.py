@@ -537,7 +537,12 @@ def test_faults_on_the_bus_never_become_values() -> None:
     survive(10_000, seed=1)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_million_faults_on_the_bus_never_become_values() -> None:
-    survive(1_000_000, seed=2)
+MANY = [
+    pytest.param(100_000, marks=pytest.mark.slow),
+    pytest.param(1_000_000, marks=[pytest.mark.long, pytest.mark.timeout(900)]),
+]
+
+
+@pytest.mark.parametrize("count", MANY)
+def test_very_many_faults_on_the_bus_never_become_values(count: int) -> None:
+    survive(count, seed=2)

@@ -685,26 +685,29 @@ def test_flipped_bits() -> None:
     flipped_bits(20_000, seed=1)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_million_flipped_bits() -> None:
-    flipped_bits(1_000_000, seed=2)
+MANY = [
+    pytest.param(100_000, marks=pytest.mark.slow),
+    pytest.param(1_000_000, marks=[pytest.mark.long, pytest.mark.timeout(900)]),
+]
+
+
+@pytest.mark.parametrize("count", MANY)
+def test_very_many_flipped_bits(count: int) -> None:
+    flipped_bits(count, seed=2)
 
 
 def test_noise() -> None:
     random_bytes(100_000, seed=2)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_million_faults_of_the_line() -> None:
-    decode_mutations(1_000_000, seed=3)
+@pytest.mark.parametrize("count", MANY)
+def test_very_many_faults_of_the_line(count: int) -> None:
+    decode_mutations(count, seed=3)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_million_bytes_of_noise() -> None:
-    random_bytes(1_000_000, seed=4)
+@pytest.mark.parametrize("count", MANY)
+def test_very_many_bytes_of_noise(count: int) -> None:
+    random_bytes(count, seed=4)
 
 
 def test_set_up_over_a_faulty_line_ends_in_the_error_family_or_right() -> None:

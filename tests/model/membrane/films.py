@@ -72,8 +72,9 @@ def assert_honest(cases: Cases, tolerances: tuple[float, ...], wrinkling: Wrinkl
     count = len(cases.films)
     for tolerance in tolerances:
         c = compare(cases, truth, tolerance, wrinkling)
-        assert np.mean(c.error <= 3.0 * c.estimate) >= 0.99
-        assert np.mean(c.error <= tolerance) >= 0.99
+        few = max(1.0, 0.01 * c.error.size)
+        assert np.sum(~(c.error <= 3.0 * c.estimate)) <= few
+        assert np.sum(~(c.error <= tolerance)) <= few
         assert np.all(c.error <= 10.0 * c.estimate)
         assert np.all(c.estimate <= tolerance)
         # Slack states have a solution of the plain equations, with no tension to hold it: it is not an answer.

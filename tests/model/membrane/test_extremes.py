@@ -140,14 +140,19 @@ def test_nothing_goes_unsaid() -> None:
     assert compared > 0.5 * len(films)
 
 
-@pytest.mark.parametrize(
-    "every",
-    [
-        pytest.param(12, marks=[pytest.mark.slow, pytest.mark.timeout(300)]),
-        pytest.param(1, marks=[pytest.mark.long, pytest.mark.timeout(900)]),
-    ],
-)
-def test_nothing_goes_unsaid_on_five_thousand_states(every: int) -> None:
+@pytest.mark.slow
+def test_nothing_goes_unsaid_on_hundreds_of_states() -> None:
+    films, h, v = grid([1e-5, 0.02, 0.3], [1.0, 2.0], [5e-8, 0.03, 1.0], [0, 0.9, 1.1])
+    assert len(films) > 300
+    for wrinkling in ("plain", "tension_field"):
+        answered, compared = check(films, h, v, wrinkling, compare=40)
+        assert answered > 0.4 * len(films)
+        assert compared > 0.7 * 40, wrinkling
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_nothing_goes_unsaid_on_five_thousand_states() -> None:
     films, h, v = grid(
         [1e-5, 1e-3, 0.02, 0.3, 0.9],
         [1.0, 1.2, 2.0],
@@ -155,10 +160,7 @@ def test_nothing_goes_unsaid_on_five_thousand_states(every: int) -> None:
         [0, 0.5, 0.9, 1.0, 1.1, 1.5, 2, 3],
     )
     assert len(films) >= 5000
-    drawn = np.sort(np.random.default_rng(4).permutation(len(films))[::every])
-    films, h, v = [films[k] for k in drawn], h[drawn], v[drawn]
-    judged = 240 // every
     for wrinkling in ("plain", "tension_field"):
-        answered, compared = check(films, h, v, wrinkling, compare=judged)
+        answered, compared = check(films, h, v, wrinkling, compare=240)
         assert answered > 0.4 * len(films)
-        assert compared > 0.8 * judged, wrinkling
+        assert compared > 0.8 * 240, wrinkling
