@@ -312,6 +312,16 @@ def solve(
     )
 
 
+def hangs_slack(specimen: Specimen, h: float, voltage: float) -> bool:
+    """Whether no tension can hold the film, at once and without a solution: for those who must not wait.
+
+    Sufficient, not necessary: the film, stretched like a straight cone both ways, would push outwards.
+    """
+    if not (math.isfinite(h) and math.isfinite(voltage)) or voltage == 0.0:
+        return False
+    return bool(_Block(_Inputs.gather(specimen, h, voltage), np.zeros(1, np.intp), Evaluations()).slack()[0])
+
+
 class _Block:
     """Some of the states, in dimensionless form, and the way back to SI."""
 

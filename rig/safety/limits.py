@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from model.membrane.solve import Solution, Status, solve, solve_many
+from model.membrane.solve import Solution, Status, hangs_slack, solve, solve_many
 from model.specimen import Specimen
 from rig.base.errors import LimitError
 from rig.scene.scene import Scene
@@ -137,6 +137,9 @@ class FilmLimits:
     def __init__(self, specimen: Specimen, limits: Limits) -> None:
         self._specimen = specimen
         self._limits = limits
+        # What is loaded or tabulated on first use takes a tenth of a second: now, and not between two turns of a loop.
+        hangs_slack(specimen, FLAT_M, 1.0)
+        solve(specimen, FLAT_M, 1.0)
 
     def check(self, h: float, voltage: float, where: str) -> None:
         """Raise unless the film at ``h`` metres and ``voltage`` volts is taut and within its limits.
@@ -146,11 +149,13 @@ class FilmLimits:
         LimitError
             Naming ``where`` and the quantity that does not hold.
         """
+        if hangs_slack(self._specimen, max(h, FLAT_M), voltage):  # the solver would look for long
+            raise LimitError(f"{where}: the model has no taut state there. {Status.SLACK.message}")
         state = solve(self._specimen, max(h, FLAT_M), voltage)
         self._limits.field.check(state.peak_field, where)
         self._limits.hoop_stress.check(state.min_hoop_stress, where)
         if state.status is not Status.TAUT:
-            raise LimitError(f"{where}: the model has no taut state there ({state.status.message}).")
+            raise LimitError(f"{where}: the model has no taut state there. {state.status.message}")
         self._limits.energy.check(self._energy(state), where)
         self._limits.stretch.check(state.max_stretch, where)
 

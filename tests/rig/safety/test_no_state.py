@@ -84,3 +84,16 @@ def test_the_plan_refuses_one_such_state_on_the_way(monkeypatch: pytest.MonkeyPa
 def test_the_simulated_film_has_no_state_there(film: Specimen, h: float, volts: float) -> None:
     _, _, found = solve_membrane(film, np.array([h, h]), np.array([0.5 * volts, volts]))
     np.testing.assert_array_equal(found, [True, False])
+
+
+def test_a_film_that_hangs_slack_is_refused_without_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search takes up to half a second, in which the guard would be taken for dead."""
+    film = SCENE.specimen.specimen()
+    guarded = FilmLimits(film, _limits())
+    for h, volts in ((0.0, 3000.0), (2e-3, 3000.0), (14e-3, 5000.0)):
+        assert membrane.solve(film, max(h, 1e-6), volts).status is Status.SLACK
+        with monkeypatch.context() as patch, pytest.raises(LimitError, match="hangs slack"):
+            patch.setattr(safety, "solve", None)
+            guarded.check(h, volts, "there")
+    for h, volts in ((0.0, 0.0), (2e-3, 1000.0), (11e-3, 1500.0)):
+        assert not membrane.hangs_slack(film, max(h, 1e-6), volts)
