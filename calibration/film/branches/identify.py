@@ -218,7 +218,8 @@ class _Found:
             unit = [np.zeros(len(film.mu)), np.zeros(len(film.alpha))]
             unit[kind == "alpha"][k] = 1.0
             slopes[name] = self.gradient(unit[0], unit[1])
-            found[name] = self.quantity(value, slopes[name], "Pa" if kind == "mu" else "1", base.quantities[name])
+            like = base.quantities[name]
+            found[name] = _widened(self.quantity(value, slopes[name], "Pa" if kind == "mu" else "1", like), like)
         found["G"] = self.quantity(film.shear_modulus, self.gradient(*shear_slopes(film)), "Pa")
         found["stiffness"] = self.stiffness(*base.stretch)
         found["stiffness_fixed"] = self.stiffness(*base.fixed_stretch)
@@ -359,6 +360,23 @@ class _Found:
             quick=quick,
             traces=self.traces(),
         )
+
+
+def _widened(quantity: Quantity, like: Quantity) -> Quantity:
+    """At least as uncertain as ``like``, which the relaxed curves say.
+
+    A term that hardly matters here is known less well than slopes here say: other laws explain the data too.
+    """
+    if not like.uncertainty > quantity.uncertainty:
+        return quantity
+    others = math.sqrt(like.uncertainty**2 - quantity.uncertainty**2)
+    relative = like.uncertainty / abs(quantity.value) if quantity.value else math.inf
+    return replace(
+        quantity,
+        uncertainty=like.uncertainty,
+        budget={**quantity.budget, "other solutions": others},
+        verdict=verdict(relative, quantity.at_bound),
+    )
 
 
 def _round_up(seconds: float) -> float:
