@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Generic, Literal, NamedTuple, Self, TypeVar
 
@@ -188,7 +189,7 @@ class Codec:
 S = TypeVar("S", ForceSample, DisplacementSample, MonitorSample)
 
 
-class AsciiStream(Generic[S]):
+class AsciiStream(ABC, Generic[S]):
     """A sensor whose lines are read; nothing is sent.
 
     It is ``ready`` with the first line that is understood. ``units`` are the SI values of 1 in each unit, the usual
@@ -310,11 +311,13 @@ class AsciiStream(Generic[S]):
                 "Correct rate_Hz in the scene, or the rate in the instrument; or the line loses data.",
             )
 
+    @abstractmethod
     def _scale_in_words(self) -> dict[str, str]:
-        raise NotImplementedError  # each quantity has its own, below
+        """The scale, for the settings."""
 
+    @abstractmethod
     def _sample(self, t: float, value: float, flags: SampleFlag) -> S:
-        raise NotImplementedError  # each quantity has its own, below
+        """A sample of the quantity in SI units."""
 
 
 class AsciiForce(AsciiStream[ForceSample]):

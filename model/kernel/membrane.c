@@ -2,8 +2,8 @@
 
    It treats taut films of one element that are on the branch from rest by a look at their energy, or by few steps of
    the voltage, and wrinkled ones that the voltage does not soften; every other state is left to the methods for arrays
-   (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so
-   that nothing depends on the others. */
+   (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so that nothing depends on the
+   others. */
 #include "connected.h"
 #include "tension_field.h"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from typing import Generic, TypeVar
@@ -16,7 +17,7 @@ from drivers.settings import Quantity
 S = TypeVar("S", ForceSample, DisplacementSample, MonitorSample)
 
 
-class AnalogInput(Generic[S]):
+class AnalogInput(ABC, Generic[S]):
     """One input, read at a rate. Set-up proves the LabJack and sets the input's range; it changes no output.
 
     Parameters
@@ -103,8 +104,9 @@ class AnalogInput(Generic[S]):
             volts = math.nan
         self._samples.append(self._sample(t, volts, flags))
 
+    @abstractmethod
     def _sample(self, t: float, volts: float, flags: SampleFlag) -> S:
-        raise NotImplementedError  # each quantity has its own, below
+        """A sample of the quantity in SI units."""
 
 
 class AnalogForce(AnalogInput[ForceSample]):
