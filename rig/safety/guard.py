@@ -19,6 +19,7 @@ from rig.base.errors import Breakdown, BreakdownCurrent, FaultError, LimitError,
 from rig.safety.commanded import DEVIATION_PART, DEVIATION_V, CommandedRamp
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limit, Limits
+from rig.safety.stopped import LOOK_S, Peer
 
 if TYPE_CHECKING:
     from rig.safety.remote import RemoteGuard
@@ -71,6 +72,8 @@ class Guard:
         How old the newest good sample of each role may be while armed (s), by the engine's `heartbeat`.
     second : SecondReading, optional
         A monitor of the voltage: off is only what both show. Its readings come by `on_monitor`.
+    engine : Peer, optional
+        The engine's process, where it is another one: whether it was stopped.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class Guard:
         tell: Callable[[str, str], None],
         fresh: Mapping[str, float] | None = None,
         second: SecondReading | None = None,
+        engine: Peer | None = None,
     ) -> None:
         self.state = GuardState.SAFE
         self.cause = "not armed"
@@ -96,6 +100,7 @@ class Guard:
         self._tell = tell
         self._fresh = dict(fresh or {})
         self._second = second
+        self._engine = engine
         self._beat: Heartbeat | None = None
         self._alive_at: float | None = None  # when the engine last gave a sign of life; None: not yet since arming
         self.longest_silence = 0.0  # s between two signs of life while armed; to be held against DEADLINE_S
@@ -334,7 +339,7 @@ class Guard:
         Raises
         ------
         FaultError
-            The engine has been silent for longer than `DEADLINE_S`: off at once.
+            The engine has been silent for longer than `DEADLINE_S`, or was stopped: off at once.
         StaleData
             A sensor's newest good sample is too old: ramped down.
         LimitError
@@ -362,6 +367,8 @@ class Guard:
         silent = now - self._alive_at
         if not silent <= DEADLINE_S:
             raise self._off(f"the engine has been silent for {silent * 1e3:.0f} ms")
+        if silent > LOOK_S and self._engine is not None and self._engine.stopped:
+            raise self._off(f"the engine was stopped, and has been silent for {silent * 1e3:.0f} ms")
         if self._beat is None:
             return
         for role, allowed in self._fresh.items():

@@ -44,6 +44,7 @@ from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import ADVICE, GIVE_BACK, NOT_SAFE, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.safety.second import SecondReading
+from rig.safety.stopped import Peer
 from rig.safety.taken_over import TakenOver
 from rig.scene.scene import Scene
 
@@ -56,6 +57,7 @@ BEGIN_S = 30.0  # how long the engine may take to say what is to be guarded
 TRY_S = 3600.0  # how long a supply that does not obey is told again after the engine has gone, unless a signal ends it
 ENDING = ("SIGINT", "SIGTERM")  # signals that the guard obeys once its engine has gone and it has said NOT SAFE
 GIVE_BACK_S = 1.0  # how long the supply may take to confirm that it has its settings back
+HUNG_S = 0.5  # an engine that has said nothing for so long reads no monitor either
 SPEAK_S = 1.0  # how long the last word may wait for a terminal that takes nothing
 STDERR = 2
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
@@ -103,7 +105,7 @@ def serve(end: socket.socket) -> None:
         channel.send({"is": "error", "error": pack_error(error)})
         return
     clock = RealClock(known["zero"], known["ns"])
-    server = Server(scene, scene.hv, link, channel, clock)
+    server = Server(scene, scene.hv, link, channel, clock, Peer(int(begin["engine"])))
     try:
         server.run()
     finally:
@@ -135,18 +137,21 @@ def _detach() -> None:
 class Server:
     """Runs the guard's loop until the engine closes the channel and the output has been taken care of."""
 
-    def __init__(self, scene: Scene, table: SupplySettings, link: Link, channel: Channel, clock: RealClock) -> None:
+    def __init__(
+        self, scene: Scene, table: SupplySettings, link: Link, channel: Channel, clock: RealClock, engine: Peer
+    ) -> None:
         self._scene = scene
         self._table = table
         self._link = link
         self._channel = channel
         self._clock = clock
+        self._engine = engine
         self._host = HostTime(clock)
         self._supply: HVSupply | None = None
         self._guard: Guard | None = None
         self._gain = 1.0
-        self._monitor: TakenOver | None = None  # read from here only when the engine has gone
-        self._polled_at = 0.0
+        self._monitor: TakenOver | None = None  # read from here only when the engine does not
+        self._polled_at = self._heard_at = 0.0
         self._log: RemoteLog | None = None
         self._next_state = self._next_alive = 0.0
         self._again = 0.0
@@ -173,6 +178,7 @@ class Server:
 
     def close(self) -> None:
         """Let go of the log."""
+        self._engine.close()
         log, self._log = self._log, None
         if log is not None:
             log.close()
@@ -181,7 +187,10 @@ class Server:
 
     def _turn(self) -> None:
         # First everything that has arrived: a guard that was held up must not blame the engine for it.
-        for message in self._receive():
+        messages = self._receive()
+        if messages:
+            self._heard(self._clock.now())
+        for message in messages:
             self._obey(message)
         guard, supply = self._guard, self._supply
         if guard is None or supply is None:
@@ -196,6 +205,12 @@ class Server:
         elif now >= self._next_alive:
             self._channel.send({"is": "alive"})
             self._next_alive = now + ALIVE_S
+
+    def _heard(self, now: float) -> None:
+        """The engine turns: what it lent is its own again."""
+        if self._monitor is not None and now - self._heard_at > HUNG_S:
+            self._monitor.leave()
+        self._heard_at = now
 
     def _receive(self) -> list[Message]:
         try:
@@ -214,10 +229,17 @@ class Server:
             assert isinstance(raw, HVSample)
             self._tell_sample(raw)
             guard.on_sample(self._by_certificate(raw))
-        if self._channel.closed and self._monitor is not None:
+        if self._monitor is not None and self._reads_the_monitor(guard):
             for reading in self._monitor.poll(self._polled_at):
                 self._tell_reading(reading)
                 self._take_reading(reading)
+
+    def _reads_the_monitor(self, guard: Guard) -> bool:
+        """Whether nobody else does: the engine has ended, or is stopped or hung and the output not proven off yet."""
+        if self._channel.closed:
+            return True
+        silent = self._polled_at - self._heard_at
+        return silent > HUNG_S and guard.commanded and guard.state is GuardState.SAFE
 
     def _find_again(self) -> None:
         """Open a link that was lost as soon as it is back; the off is sent at once then."""
@@ -333,7 +355,7 @@ class Server:
         fresh = {str(role): float(age) for role, age in message["fresh"].items()}
         second = SecondReading.of(self._scene, limits.measured_voltage.high)
         ramp = self._table.ramp_V_per_s
-        self._guard = Guard(self._supply, limits, film, ramp, self._tell_command, fresh, second)
+        self._guard = Guard(self._supply, limits, film, ramp, self._tell_command, fresh, second, self._engine)
         if self._monitor is not None:
             self._monitor.gain = float(message["second_gain"])
 

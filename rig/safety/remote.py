@@ -10,6 +10,7 @@ measured.
 from __future__ import annotations
 
 import math
+import os
 import select
 import socket
 from collections import deque
@@ -30,6 +31,7 @@ from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import AT_ONCE_S, Guard, GuardState, ramp_limit
 from rig.safety.limits import FilmLimits, Limits
 from rig.safety.second import SecondReading
+from rig.safety.stopped import LOOK_S, Peer
 from rig.scene.scene import Scene
 
 START_S = 30.0  # until the process must have the link; a slow disk has many modules to read
@@ -85,7 +87,7 @@ class RemoteGuard:
         self._answers: dict[int, Message | None] = {}
         self._calls = 0
         self._is_open = False
-        self._heard_at = clock.now()
+        self._heard_at = self._spoke_at = clock.now()  # the first goes on while nobody listens
         self._lost = ""  # why the process is lost
         self._listened_at = clock.now()
         self._successor: tuple[HVSupply, Guard] | None = None  # made ready; in charge once the guard is lost
@@ -106,7 +108,8 @@ class RemoteGuard:
             self._process = start.start_guard(theirs)
         finally:
             theirs.close()
-        begin = {"do": "begin", "config": process.config(self._scene, self._clock).decode()}
+        self._peer = Peer(self._process.pid)
+        begin = {"do": "begin", "config": process.config(self._scene, self._clock).decode(), "engine": os.getpid()}
         descriptors = tuple(getattr(self._link, "descriptors", ()))
         if descriptors:
             self._channel.hand_over(begin, *descriptors)
@@ -198,6 +201,7 @@ class RemoteGuard:
             self._heard_at = min(self._heard_at + late, now)
         self._listened_at = now
         self._listen()
+        self._look_whether_stopped()
         if not self._lost and now - self._heard_at > (SILENCE_S if self.commanded else UNARMED_S):
             self._lose(f"it has said nothing for {now - self._heard_at:.2f} s")
         if self._lost:
@@ -223,6 +227,7 @@ class RemoteGuard:
         if self._link is not None:
             self._link.close()
             self._link = None
+        self._peer.close()
 
     # As a guard ----------------------------------------------------------------------------------------------
 
@@ -309,8 +314,9 @@ class RemoteGuard:
                     self._lose(f"it did not answer within {time_out:g} s")
                     break
                 if not self._channel.closed:
-                    select.select([self._channel], [], [], left)
+                    select.select([self._channel], [], [], min(left, LOOK_S))
                 self._listen()
+                self._look_whether_stopped()
             if number in self._answers:
                 error = self._answers.pop(number)
                 if error is not None:
@@ -326,11 +332,17 @@ class RemoteGuard:
             self._lose(f"its messages are corrupt: {error}")
             return
         if messages:
-            self._heard_at = self._clock.now()
+            self._heard_at = self._spoke_at = self._clock.now()
         for message in messages:
             self._take(message)
         if self._channel.closed:
             self._lose("its process has died")
+
+    def _look_whether_stopped(self) -> None:
+        """A guard that was stopped is lost at once: no loaded computer does that."""
+        silent = self._clock.now() - self._spoke_at
+        if silent > LOOK_S and not self._lost and self._peer.stopped:
+            self._lose(f"its process was stopped, and has said nothing for {silent:.2f} s")
 
     def _take(self, message: Message) -> None:
         match message.get("is"):

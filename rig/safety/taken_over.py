@@ -1,4 +1,4 @@
-"""The monitor of the voltage in the guard's process, once the engine that read it has gone."""
+"""The monitor of the voltage in the guard's process, while the engine that read it is stopped, hangs or has ended."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _untold(role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:
 
 
 class TakenOver:
-    """Reads on where the engine has ended, on the descriptors that it lent; sends nothing before the first `poll`.
+    """Reads on where the engine has left off, on the descriptors that it lent; sends nothing before the first `poll`.
 
     Attributes
     ----------
@@ -51,6 +51,10 @@ class TakenOver:
             self._device = None
             return NOTHING
         return [replace(sample, value=sample.value * self.gain) for sample in samples]
+
+    def leave(self) -> None:
+        """The engine goes on and reads by itself. An answer that is still to come its driver takes, or drops."""
+        self._device = None
 
     def close(self) -> None:
         """Let go of it."""

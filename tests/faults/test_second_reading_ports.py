@@ -6,6 +6,7 @@ What is asserted is what the simulated supply's own output did.
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 
 import pytest
@@ -101,3 +102,32 @@ def test_a_guard_that_is_killed_leaves_both_to_the_engine(stand: Stand, live: Ru
     outcome = read_log(live.log).outcome
     assert live.status == 4 and outcome is not None and outcome["safe"] == "yes"
     assert "(monitor) shows" in outcome["second_reading"]
+
+
+def test_an_engine_that_is_stopped_leaves_the_monitor_to_the_guard_until_it_goes_on(stand: Stand, live: Run) -> None:
+    at = stand.kill(live.engine, signal.SIGSTOP)
+    stand.wait(lambda: stand.off_after(at) is not None, "the output's end")
+    stand.wait(lambda: stand.bench.voltage() < 60.0, "the output's discharge")
+    off = stand.bench.clock.now()
+    stand.wait(lambda: stand.bench.clock.now() > off + 6.0, "the guard's judgement")
+    assert live.status is None and "NOT SAFE" not in live.said
+    stand.kill(live.engine, signal.SIGCONT)
+    stand.wait_until_alone(live)
+    outcome = read_log(live.log).outcome
+    assert live.status == 4 and outcome is not None and outcome["safe"] == "yes"
+    assert "(monitor) shows" in outcome["second_reading"] and "NOT SAFE" not in live.said
+
+
+def test_an_engine_that_is_stopped_beside_a_supply_that_lies_is_called_not_safe_by_the_guard(
+    stand: Stand, live: Run
+) -> None:
+    lie(stand, True)
+    at = stand.kill(live.engine, signal.SIGSTOP)
+    stand.wait(lambda: "dea-rig guard: NOT SAFE" in live.said, "the guard's word")
+    assert stand.bench.voltage() > 780.0 and live.status is None
+    assert "(monitor) shows" in live.said
+    lie(stand, False)
+    stand.wait(lambda: stand.off_after(at) is not None, "the output's end")
+    stand.kill(live.engine, signal.SIGCONT)
+    stand.wait_until_alone(live)
+    assert stand.bench.voltage() < 60.0 and live.status == 4
