@@ -8,7 +8,7 @@ import click
 
 from rig.cli.files import FOLDER
 
-ROLES = ("stage", "force", "displacement", "hv")
+ROLES = ("stage", "force", "displacement", "hv", "monitor")
 
 
 @click.command("new-driver")

@@ -133,6 +133,9 @@ _SENSOR = {
     "PROPOSED": "",
     "RATE": "rate_Hz",
     "RATE_DEFAULT": "50.0",
+    "MORE_ARGUMENTS": "",
+    "MORE_STATE": "",
+    "IMPORT_PROBE": "",
 }
 PARTS: dict[str, dict[str, str]] = {
     "force": _SENSOR
@@ -245,6 +248,39 @@ PARTS: dict[str, dict[str, str]] = {
         "VALUE": "voltage",
         "EXAMPLE_SI": "0.25",
         "FAKE_WORLD": "SimpleNamespace(output=SimpleNamespace(at=lambda t: (0.25, 0.0)))",
+        "TWIN_SI": "0.25",
+    },
+    "monitor": _SENSOR
+    | {
+        "ROLE_WORDS": "monitor",
+        "ROLE_CLASS": "Monitor",
+        "MEANING": "the number that it shows",
+        "TYPING": "",
+        "IMPORT_ROLES": "Identity, MonitorSample",
+        "IMPORT_SETTINGS": "MonitorSettings, Quantity, SerialSettings",
+        "SETTINGS_BASES": "MonitorSettings, SerialSettings",
+        "RATE_FIELD": "",
+        "RATE_DEFAULT": "5.0",
+        "SAFE_NOTE": "\n\n    ``to_si`` (factor, offset) makes V, K or 1 of its number, as the scene says.\n    ",
+        "MORE_ARGUMENTS": """        quantity: Quantity = "voltage",
+        to_si: tuple[float, float] = (1.0, 0.0),
+""",
+        "MORE_STATE": """        self.quantity = quantity
+        self._factor, self._offset = to_si
+""",
+        "READING_FIELDS": "    number: float\n",
+        "SAMPLE": "MonitorSample",
+        "MAKE_SAMPLE": """MonitorSample(
+            t, self.name, self.quantity, reading.number * self._factor + self._offset
+        )""",
+        "PROPOSED": ', "quantity": "voltage"',
+        "IMPORT_PROBE": "from rig.sim.probe import Probe\n",
+        "TRUTH_BASES": "MonitorTruth, LineTruth",
+        "IMPORT_TRUTH": "Fault, LineTruth, MonitorTruth",
+        "TRUE_READING": 'f"{Probe(self._truth, world, self._rng).number(t):+.5f}"',
+        "VALUE": "value",
+        "EXAMPLE_SI": "0.01234",
+        "FAKE_WORLD": "SimpleNamespace(output=SimpleNamespace(at=lambda t: (250.0, 0.0)))",
         "TWIN_SI": "0.25",
     },
 }
