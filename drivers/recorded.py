@@ -51,6 +51,10 @@ class Dialect:
         """The answers of ``exchange``, given to ``request``."""
         return exchange.answers
 
+    def unknown(self, request: bytes) -> bytes:
+        """What it says to a request that only later releases make, where the log has none; empty: nothing is known."""
+        return b""
+
 
 class Frames(Dialect):
     """CAN frames come one by one."""

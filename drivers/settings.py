@@ -10,7 +10,7 @@ import socket
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 if TYPE_CHECKING:
     from drivers.links.link import ByteLink, FrameLink
@@ -63,10 +63,20 @@ class InstrumentSettings(Table):
         description="Calibration certificate, seen from the scene. Absent: values as stated.",
     )
 
+    _looked_first: bool | None = PrivateAttr(default=None)
+
     @property
     def connected(self) -> bool:
         """Whether a port or bus is named."""
         return any(getattr(self, key) is not None for key in self.place_keys)
+
+    @property
+    def looks_first(self) -> bool:
+        """Whether the driver reads what it changes before it does, to put it back: where a device outlives the run."""
+        return self.connected if self._looked_first is None else self._looked_first
+
+    def as_recorded(self, sent: Sequence[bytes]) -> None:
+        """From now on the driver looks first if it did when ``sent`` was recorded; earlier releases did not."""
 
     @property
     def sample_rate(self) -> float:

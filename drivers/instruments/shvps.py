@@ -15,6 +15,8 @@ the set-point.
 There is no ramp: the set-point is moved in steps at the polling rate. When the host dies, the voltage stays.
 The current is not measured (NaN) and not limited beyond what the converter can give: `set_current_limit` refuses.
 There is no latch: an emergency off is remembered here, until `clear`.
+Regulation (``VMode``) and source of the switching (``SwSrc``) are changed when it is switched on, and given back as
+they were found once it is off. The set-point is not: it stays 0 V, since the source may be a switch that is on.
 
 Source: EPFL NERDv3, libs/hvps.py (library 2.8, firmware 8). Not tried on hardware.
 """
@@ -24,7 +26,7 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import ClassVar, Literal, TypeVar
 
 from pydantic import Field
@@ -42,6 +44,8 @@ from drivers.settings import SerialSettings, SupplySettings
 T = TypeVar("T")
 
 OFF, STEADY, SWITCHING, WAVEFORM = range(4)
+MODES = "VMode", "SwSrc"
+"""What switching on changes beside set-point and state."""
 
 TRIES = 3
 PLAUSIBLE = 1.2
@@ -115,6 +119,10 @@ class ShvpsSettings(SupplySettings, SerialSettings):
         description="How often voltage and state are read (Hz); the ramp is made in steps at this rate. Typical: 10.",
     )
 
+    def as_recorded(self, sent: Sequence[bytes]) -> None:
+        first = next((request for request in sent if b"VMode" in request), b"")
+        self._looked_first = first.startswith(b"Q")
+
 
 class Shvps:
     """A `drivers.roles.HVSupply`. Set-up asks and changes nothing.
@@ -133,6 +141,9 @@ class Shvps:
         Ramp until `set_ramp` says otherwise.
     boot_s : float
         How long the first answer may take.
+    looks_first : bool
+        Whether it reads the modes that it changes when it is switched on. Recorded dialogues of earlier releases did
+        not.
     """
 
     measures_current = False
@@ -146,6 +157,7 @@ class Shvps:
         timeout_s: float = 0.1,
         ramp_V_per_s: float = 100.0,
         boot_s: float = 0.0,
+        looks_first: bool = False,
     ) -> None:
         self.name = name
         self.identity = Identity()
@@ -170,6 +182,9 @@ class Shvps:
         self._target = self._setpoint = 0
         self._stepped_at: float | None = None  # None: with the next cycle a ramp begins
         self._on = self._emergency = False
+        self._looks_first = looks_first
+        self.found: dict[str, float] = {}
+        self._present: dict[str, float] = {}
         self._dialogue.begin(self._set_up())
 
     @property
@@ -248,6 +263,22 @@ class Shvps:
 
     def clear(self) -> None:
         self._emergency = False
+
+    @property
+    def given_back(self) -> bool:
+        """Whether both modes are as they were found, read back."""
+        return self._present == self.found
+
+    def resume_found(self, found: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """Another program found it so, and changed it."""
+        self.found = {word: found[word] for word in MODES if word in found}
+        self._present = {}
+        return {word: (math.nan, value) for word, value in self.found.items()}
+
+    def give_back(self) -> None:
+        """Put both modes back; the output must be off, and is looked at once more afterwards."""
+        if self._ready and not self.given_back:
+            self._command(self._giving_back())
 
     def poll(self, now: float) -> Sequence[HVSample]:
         self._now = now
@@ -409,10 +440,27 @@ class Shvps:
             return
         if self._jack_missing:
             raise DeviceRefused(self._label, "its power jack is not plugged in", "Plug it in and start again.")
-        for word, value in (("Vset", 0), ("VMode", 0), ("SwSrc", 0), ("SwMode", STEADY)):
-            yield from self._set(word, value)
+        yield from self._set("Vset", 0)
+        for word in MODES:
+            if self._looks_first and word not in self.found:
+                self.found[word] = float((yield from self._confirmed(f"Q{word}", 0)))
+            if word in self.found:
+                self._present[word] = math.nan
+            yield from self._set(word, 0)
+            if word in self.found:
+                self._present[word] = 0.0
+        yield from self._set("SwMode", STEADY)
         self._setpoint, self._on = 0, True
         self._stepped_at = self._now
+
+    def _giving_back(self) -> Script[str, str]:
+        for word, value in self.found.items():
+            yield from self._set(word, int(value))
+            self._present[word] = value
+        if (yield from self._number("QSwMode")) != OFF:
+            for word in (*MODES, "SwMode"):
+                yield from self._set(word, OFF)
+            raise DeviceRefused(self._label, "it switched itself on when its modes were given back; off again", _UNSAFE)
 
     def _switch_off(self) -> Script[str, str]:
         self._target = 0
@@ -466,13 +514,21 @@ def _ask(line: Line) -> list[Answered]:
     return [Answered(found, {}, remark)]
 
 
+class Board(Dialect):
+    """Lines that end in CR."""
+
+    def unknown(self, request: bytes) -> bytes:
+        """Logs of earlier releases do not say what the modes were before they were set."""
+        return b"0\r\n" if request in map(encode, (f"Q{word}" for word in MODES)) else b""
+
+
 INSTRUMENTS = (
     Instrument(
         driver="shvps",
         role="hv",
         settings=ShvpsSettings,
         device=Shvps,
-        dialect=Dialect(b"\r"),
+        dialect=Board(b"\r"),
         probe=SerialProbe(_ask, order=40),
     ),
 )

@@ -1,16 +1,18 @@
-"""Settings that a run changes in the stage, and that the stage gets back whatever ends the run.
+"""Settings that a run changes in stage and sensors, and that they get back whatever ends the run.
 
 The driver gives them back when the run ends. A run that is killed cannot, so what was found is kept in a file of the
-user's own directory until the stage has confirmed that it has everything back; the next run with this stage reads it,
-compares it with what the stage has now, and gives back at its end what the killed one had found.
+user's own directory until the instrument has confirmed that it has everything back; the next run with it reads the
+file, compares it with what the instrument has now, and gives back at its end what the killed one had found.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from drivers.links.own_directory import remove_if_empty, user_directory
@@ -18,56 +20,68 @@ from drivers.roles import GivesBack
 from rig.base.errors import ConfigError
 from rig.base.outputs import write_text
 from rig.bench.bench import Bench
+from rig.bench.devices import ROLE
 from rig.log.recorder import Recorder
 
-GIVE_BACK_S = 1.0  # how long the stage may take to confirm that it has its settings back
+GIVE_BACK_S = 1.0  # how long an instrument may take to confirm that it has its settings back
 LARGEST = 4096  # bytes of such a file
 
 
 class Lent:
-    """What one run has of the stage."""
+    """What one run has of the instruments that the engine's loop owns."""
 
     def __init__(self, bench: Bench, recorder: Recorder) -> None:
         self._bench = bench
         self._recorder = recorder
-        self._path: Path | None = None
+        self._paths: dict[str, Path] = {}
 
     def begin(self) -> None:
-        """After set-up, before anything is changed: look what a killed run has left, and keep what there is."""
-        stage = self._bench.stage
-        if not isinstance(stage, GivesBack) or not self._bench.scene.stage.connected:
+        """After set-up, before anything moves: look what a killed run has left, and keep what there is."""
+        for role, device in self._lenders().items():
+            if self._bench.scene.instruments[role].connected:
+                try:
+                    self._begin(role, device)
+                except (OSError, ConfigError) as error:
+                    self._paths.pop(role, None)
+                    what = "what this run changes is not kept in a file, should it be killed"
+                    self._recorder.event("warning", role, f"{what} ({error})")
+
+    def _begin(self, role: str, device: GivesBack) -> None:
+        if not device.found:
             return
-        try:
-            who = stage.identity
-            self._path = user_directory() / f"stage-{_plain(who.model)}-{_plain(who.serial)}.json"
-            left = stage.resume_found(_read(self._path))
-            if left:
-                now_found = ", ".join(f"{key} {value}" for key, value in stage.found.items())
-                self._recorder.command("stage", "resume_found", now_found)
-                what = ", ".join(f"{key} {now}, before {before}" for key, (now, before) in left.items())
-                self._warn(f"an earlier run was killed and left changed: {what}; given back after this one")
-            write_text(self._path, json.dumps(dict(stage.found)) + "\n")
-        except (OSError, ConfigError) as error:
-            self._path = None
-            self._warn(f"what this run changes is not kept in a file, should it be killed ({error})")
+        who = self._bench.devices[role].identity
+        path = user_directory() / f"{role}-{_plain(who.model)}-{_plain(who.serial)}.json"
+        left = device.resume_found(_read(path))
+        if left:
+            now_found = ", ".join(f"{key} {value}" for key, value in device.found.items())
+            self._recorder.command(role, "resume_found", now_found)
+            what = ", ".join(f"{key} {now}, before {before}" for key, (now, before) in left.items())
+            message = f"an earlier run was killed and left changed: {what}; given back after this one"
+            self._recorder.event("warning", role, message)
+        write_text(path, json.dumps(dict(device.found)) + "\n")
+        self._paths[role] = path
 
     def end(self, standing: bool) -> None:
-        """Give everything back, and wait a little for the stage's word that it has it. Never raises."""
-        stage = self._bench.devices.get("stage")
-        if not isinstance(stage, GivesBack) or not standing:
-            return
-        if not stage.given_back:
-            self._recorder.command("stage", "give_back", "")
-            wait_given_back("stage", stage.give_back, lambda: stage.given_back, self._bench, self._recorder)
-        if not stage.given_back:  # the driver's close tries once more, without waiting
-            self._warn("it has not confirmed that its settings are as they were found")
-        elif self._path is not None:
-            with suppress(OSError):
-                self._path.unlink(missing_ok=True)
-                remove_if_empty(self._path.parent)
+        """Give everything back, and wait a little for each one's word that it has it. Never raises."""
+        for role, device in self._lenders().items():
+            if role == "stage" and not standing:
+                continue
+            if not device.given_back:
+                self._recorder.command(role, "give_back", "")
+                done = partial(getattr, device, "given_back")
+                wait_given_back(role, device.give_back, done, self._bench, self._recorder)
+            path = self._paths.get(role)
+            if not device.given_back:  # the driver's close tries once more, without waiting
+                self._recorder.event("warning", role, "it has not confirmed that its settings are as they were found")
+            elif path is not None:
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
+                    remove_if_empty(path.parent)
 
-    def _warn(self, what: str) -> None:
-        self._recorder.event("warning", "stage", what)
+    def _lenders(self) -> dict[str, GivesBack]:
+        """By role; what the supply has to get back its guard sees to."""
+        devices = self._bench.devices.items()
+        return {role: device for role, device in devices if role != ROLE and isinstance(device, GivesBack)}
 
 
 def wait_given_back(
@@ -100,4 +114,4 @@ def _read(path: Path) -> dict[str, float]:
         return {}
     if not isinstance(found, dict):
         return {}
-    return {key: value for key, value in found.items() if type(value) is int}
+    return {key: value for key, value in found.items() if type(value) in (int, float) and math.isfinite(value)}

@@ -84,13 +84,24 @@ class Recording:
         """Scene, protocol and certificates from inside the log, planned anew."""
         where = f"{self.log.path} ({{}} inside)"
         scene_text, protocol_text = self.text("scene.toml"), self.text("protocol.toml")
-        scene = parse_table(scene_text, Scene, "scene", where.format("scene.toml"))
+        scene = self._as_recorded(parse_table(scene_text, Scene, "scene", where.format("scene.toml")))
         protocol = parse_table(protocol_text, Protocol, "protocol", where.format("protocol.toml"))
         try:
             actions = self._actions(protocol, scene)
         except (ConfigError, LimitError) as error:
             raise LogError(self.log.path, f"its protocol cannot be planned today ({error})") from None
         return Experiment(scene, scene_text, protocol, protocol_text, self.certificates, actions, [])
+
+    def _as_recorded(self, scene: Scene) -> Scene:
+        """The scene, with instruments that ask what the release asked that made the log, and no more."""
+        sent: dict[str, list[bytes]] = {role: [] for role in scene.instruments}
+        for row in self.rows:
+            role = row.topic.removeprefix("/raw/").removesuffix("/tx")
+            if row.topic.endswith("/tx") and role in sent:
+                sent[role].append(row.fields["data"])
+        for role, table in scene.instruments.items():
+            table.as_recorded(sent[role])
+        return scene
 
     def _actions(self, protocol: Protocol, scene: Scene) -> list[Action]:
         """Of the whole protocol; of a run that took up another one, of what that had left."""

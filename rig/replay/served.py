@@ -86,6 +86,9 @@ class ServedScript:
         key = self._dialect.key(request)
         found = self._nearest(key, t) if key in self._repeated else self._coming_up(key, t)
         if found is None:
+            if refusal := self._dialect.unknown(request):
+                self._coming.append((t, refusal))
+                return
             self._depart(t, request)
         self._newest[key] = found
         self.requests += 1

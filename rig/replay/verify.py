@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from drivers.instrument import MONITORS
@@ -386,18 +387,22 @@ def commands(bench: Bench) -> dict[tuple[str, str], Callable[[Sequence[float]], 
     def stage() -> Stage:
         return bench.stage
 
-    def lender() -> GivesBack:
-        return cast(GivesBack, bench.stage)
+    def lender(role: str) -> GivesBack:
+        return cast(GivesBack, bench.devices[role])
 
-    def resume_found(values: Sequence[float]) -> None:
-        lender().resume_found(dict(zip(lender().found, map(int, values), strict=True)))
+    def resume_found(role: str, values: Sequence[float]) -> None:
+        lender(role).resume_found(dict(zip(lender(role).found, values, strict=True)))
 
+    def give_back(role: str, values: Sequence[float]) -> None:
+        lender(role).give_back()
+
+    lent = [role for role in bench.scene.instruments if role != GUARDED]
     return {
         ("stage", "home"): lambda values: stage().home(),
         ("stage", "move_to"): lambda values: stage().move_to(values[0], values[1]),
         ("stage", "stop"): lambda values: stage().stop(),
-        ("stage", "resume_found"): resume_found,
-        ("stage", "give_back"): lambda values: lender().give_back(),
+        **{(role, "resume_found"): partial(resume_found, role) for role in lent},
+        **{(role, "give_back"): partial(give_back, role) for role in lent},
         ("hv", "arm"): arm,
         ("hv", "take_down"): take_down,
         ("hv", "clear"): lambda values: supply().clear(),

@@ -51,7 +51,7 @@ ROWS: dict[int, Row] = {
         "the engine stops, opens the link itself and commands the output off",
         [
             "faults/test_processes.py::test_guard_killed",
-            "faults/test_processes.py::test_guard_that_hangs_is_ended_and_replaced_by_the_engine",
+            "faults/test_processes.py::test_guard_that_is_stopped_is_ended_and_replaced_by_the_engine",
             "faults/test_hanging.py::test_taking_over_needs_no_lock_no_file_and_no_descriptor",
             "faults/test_serial_supply.py::test_killed",
         ],
@@ -286,13 +286,17 @@ ROWS: dict[int, Row] = {
         ],
     ),
     30: (
-        "settings of stage and supply that a run changes",
+        "settings of stage, amplifier and supply that a run changes",
         "own axis and own bits only; given back as found, also after a kill",
         [
             "faults/test_stage_and_laser.py::test_the_stage_gets_back_what_it_lent_and_other_axes_are_left_alone",
             "faults/test_stage_and_laser.py::test_a_knob_that_was_disabled_stays_so",
             "faults/test_stage_and_laser.py::test_what_a_killed_run_left_is_given_back_by_the_next_one",
             "faults/test_processes.py::test_the_stage_gets_back_after_a_kill_what_it_had_lent",
+            "faults/test_lent_settings.py::test_the_amplifier_gets_back_rate_frame_type_and_stream",
+            "faults/test_lent_settings.py::"
+            "test_the_next_run_gives_back_what_a_killed_one_had_found_unless_it_was_set_since",
+            "faults/test_lent_settings.py::test_the_supply_gets_its_modes_back_and_stays_at_zero_volts",
             "faults/test_load_cell_and_supply.py::test_a_run_arms_the_supplys_own_trip_and_gives_everything_back",
             "drivers/instruments/test_iseg_edcp.py::"
             "test_bits_of_the_control_register_that_are_somebody_elses_stay_and_confuse_nobody",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 from pydantic import Field
@@ -10,6 +11,7 @@ from drivers.instrument import Instrument
 from drivers.instruments.gsv8.codec import (
     GET_FIRMWARE_VERSION,
     GET_SERIAL_NUMBER,
+    GET_TX_MODE,
     Decoder,
     FrameType,
     Reply,
@@ -21,6 +23,8 @@ from drivers.probe import FORCE_CERTIFICATE, Answered, Line, SerialProbe
 from drivers.recorded import Dialect
 from drivers.settings import ForceSettings, SerialSettings
 
+LOOKS_FIRST = encode(GET_TX_MODE, b"\x01")
+COMMAND_UNKNOWN = bytes.fromhex("AA 50 40 85")
 _OVERHEAD = 4
 """Bytes of a request beside its data: prefix, kind with the number of data bytes, command, suffix."""
 
@@ -57,6 +61,9 @@ class GSV8Settings(ForceSettings, SerialSettings):
         description="Input range (mV/V). Typical: 2 or 3.5. Absent: asked of the amplifier.",
     )
 
+    def as_recorded(self, sent: Sequence[bytes]) -> None:
+        self._looked_first = LOOKS_FIRST in sent
+
 
 def _ask(line: Line) -> list[Answered]:
     decoder = Decoder()
@@ -86,6 +93,10 @@ class CountedBytes(Dialect):
             whole.append(data[:length])
             data = data[length:]
         return whole, data
+
+    def unknown(self, request: bytes) -> bytes:
+        """Logs of earlier releases have no question for the frame type."""
+        return COMMAND_UNKNOWN if request == LOOKS_FIRST else b""
 
 
 INSTRUMENTS = (

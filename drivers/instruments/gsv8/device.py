@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import struct
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,6 +18,7 @@ from drivers.instruments.gsv8.codec import (
     GET_FIRMWARE_VERSION,
     GET_INPUT_TYPE,
     GET_SERIAL_NUMBER,
+    GET_TX_MODE,
     GET_VALUE,
     INPUT_TYPES,
     READ_DATA_RATE,
@@ -37,12 +39,15 @@ from drivers.instruments.gsv8.codec import (
     encode,
     identity,
 )
-from drivers.links.link import ByteLink, DeviceRefused
+from drivers.links.link import ByteLink, DeviceError, DeviceRefused
 from drivers.roles import ForceSample, Identity, SampleFlag
 from drivers.stream import Stream
 
 _QUIET_S = 0.05  # frames still on their way after the stream was stopped
 _UNKNOWN_RANGE_LIMIT = 100.0  # mV/V
+TX_INDEX = b"\x01"  # of what the TX mode has: the type of the values
+THIRD_TYPE = 3
+TX_TYPE, DATA_RATE = "tx_mode", "data_rate_Hz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +69,9 @@ class GSV8:
 
     The set-up dialogue stops the stream, reads serial number, firmware, input range and user scale, sets frame type
     and data rate, reads both back (the frame type from a frame), and starts the stream.
+
+    With ``looks_first`` frame type and data rate are read before they are set (`found`); `give_back` puts both back,
+    and the stream as it was: running, or not. An amplifier that does not tell them keeps what was set.
 
     The reading is the bridge signal in mV/V. For floats it is ``(value - user offset) / user scale``, times the input
     range: the manufacturer's header calls a float the product of user scale and raw value, and his helper sets the
@@ -95,6 +103,8 @@ class GSV8:
         Signal at the largest integer, in input ranges.
     boot_s : float
         How long the first answer may take.
+    looks_first : bool
+        Whether set-up reads what it changes before it does. Recorded dialogues of earlier releases did not.
     """
 
     reading_unit = "mV/V"
@@ -113,6 +123,7 @@ class GSV8:
         input_range_mV_per_V: float | None = None,
         int_full_scale: float = 1.05,
         boot_s: float = 0.0,
+        looks_first: bool = False,
     ) -> None:
         where = label(name, link)
         if not 1 <= channel <= 16:
@@ -133,6 +144,10 @@ class GSV8:
         self._timeout = timeout_s
         self._interval = poll_interval_s
         self._boot_s = boot_s
+        self._looks_first = looks_first
+        self.found: dict[str, float] = {}
+        self._present: dict[str, float] = {}
+        self._streamed = self._ended = False  # whether it streamed when it was found; whether our own stream is over
         self._heard = Heard()
         self._user_scale_of = user_scale_of
         self._range = input_range_mV_per_V
@@ -157,7 +172,7 @@ class GSV8:
 
     @property
     def ready(self) -> bool:
-        return self._stream is not None
+        return self._stream is not None or self._ended
 
     @property
     def rate(self) -> float:
@@ -178,16 +193,48 @@ class GSV8:
         self._dialogue.begin(self._zero())
         self._next_poll = -math.inf
 
+    @property
+    def given_back(self) -> bool:
+        """Whether the amplifier has frame type and data rate as they were found, by its own word."""
+        return self._present == self.found
+
+    def resume_found(self, found: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """Take over what an earlier run found; what is not as this run sets it, somebody has set since."""
+        wanted = self._set_now(self._rate)
+        left = {
+            key: (now, found[key])
+            for key, now in self.found.items()
+            if key in found and now == wanted[key] and found[key] != now
+        }
+        self.found |= {key: before for key, (_, before) in left.items()}
+        return left
+
+    def give_back(self) -> None:
+        """End the stream and put both back; a stream that ran when it was found runs again."""
+        if self._stream is not None and not self.given_back:
+            self._stream, self._ended = None, True
+            self._dialogue.begin(self._giving_back())
+            self._next_poll = -math.inf
+
     def close(self) -> None:
+        """Give back what is not yet, without waiting, and release the line."""
+        if not self.given_back:
+            with suppress(DeviceError):
+                self._link.write(encode(STOP_TRANSMISSION))
+                for command, parameters in self._as_found():
+                    self._link.write(encode(command, parameters))
+                if self._streamed:
+                    self._link.write(encode(START_TRANSMISSION))
         self._link.close()
 
     def poll(self, now: float) -> Sequence[ForceSample]:
         self._next_poll = now + LOST_AGAIN_S
         data = self._heard.bytes(self._link.read())
         if self._fresh:
+            self._streamed = bool(data)
             data = b""  # whatever was in the line belongs to an earlier conversation
         self._fresh = False
-        if self._stream is None and self._dialogue.idle:
+        if not self.ready and self._dialogue.idle:
             self._decoder.expect_any()
             self._dialogue.begin(self._set_up())
         arrived: list[ForceSample | None] = []
@@ -197,6 +244,7 @@ class GSV8:
             if isinstance(message, Measured) and self._stream is not None:
                 arrived.append(self._sample(message))
             elif not self._dialogue.offer(message, now):
+                self._streamed |= isinstance(message, Measured) and not self.ready
                 self.counters["ignored_frames" if isinstance(message, Measured) else "unexpected_answers"] += 1
         self._dialogue.run(now)
         stream = self._stream
@@ -266,7 +314,9 @@ class GSV8:
             serial.data if serial.error <= 1 else b"", firmware.data if firmware.error <= 1 else b""
         )
         yield from self._read_scaling(channel)
-        yield from self._demand(SET_TX_MODE, struct.pack(">BH", 1, TX_MODE[self._frame_type]))
+        if self._looks_first:
+            yield from self._look()
+        yield from self._demand(SET_TX_MODE, TX_INDEX + struct.pack(">H", TX_MODE[self._frame_type]))
         yield from self._demand(WRITE_DATA_RATE, struct.pack(">f", self._rate))
         data = yield from self._demand(READ_DATA_RATE, lengths=(4,))
         (rate,) = struct.unpack(">f", data)
@@ -277,10 +327,48 @@ class GSV8:
                 "Choose a rate that the amplifier supports.",
             )
         self._rate = rate
+        self._present = {key: now for key, now in self._set_now(rate).items() if key in self.found}
         self.settings["data_rate_Hz"] = f"{rate:.9g}"
         yield from self._check_frame()
         yield from self._demand(START_TRANSMISSION)
         self._stream = Stream(self._label, self._rate, self._timeout, self._interval, self.counters, self._heard)
+
+    def _set_now(self, rate: float) -> dict[str, float]:
+        return {TX_TYPE: float(TX_MODE[self._frame_type]), DATA_RATE: rate}
+
+    def _look(self) -> Generator[_Step, _Got, None]:
+        """What is about to be changed. An amplifier that does not tell one of them is given back neither."""
+        kind = yield from self._ask(GET_TX_MODE, TX_INDEX, (2,))
+        if kind.error > 0x01:
+            return
+        rate = yield from self._ask(READ_DATA_RATE, lengths=(4,))
+        if rate.error > 0x01:
+            return
+        found = _told(kind.data, rate.data)
+        if found[TX_TYPE] in TX_MODE.values() and math.isfinite(found[DATA_RATE]):
+            self.found = found
+            self.settings["found"] = ", ".join(f"{key} {value:.9g}" for key, value in found.items())
+
+    def _as_found(self) -> list[tuple[int, bytes]]:
+        """The commands that put back what is not as it was found: the frame type first, which bounds the rate."""
+        commands = []
+        if self._present.get(TX_TYPE) != self.found[TX_TYPE]:
+            commands.append((SET_TX_MODE, TX_INDEX + struct.pack(">H", int(self.found[TX_TYPE]))))
+        if commands or self._present.get(DATA_RATE) != self.found[DATA_RATE]:
+            commands.append((WRITE_DATA_RATE, struct.pack(">f", self.found[DATA_RATE])))
+        return commands
+
+    def _giving_back(self) -> Generator[_Step, _Got, None]:
+        yield from self._demand(STOP_TRANSMISSION)
+        delay_s = _QUIET_S
+        for command, parameters in self._as_found():
+            yield from self._demand(command, parameters, delay_s=delay_s)
+            delay_s = 0.0
+        kind = yield from self._demand(GET_TX_MODE, TX_INDEX, (2,))
+        rate = yield from self._demand(READ_DATA_RATE, lengths=(4,))
+        if self._streamed:
+            yield from self._demand(START_TRANSMISSION)
+        self._present = _told(kind, rate)
 
     def _read_scaling(self, channel: bytes) -> Generator[_Step, _Got, None]:
         reply = yield from self._ask(GET_INPUT_TYPE, channel + b"\xff", lengths=(5,))
@@ -345,6 +433,12 @@ class GSV8:
 
     def _zero(self) -> Generator[_Step, _Got, None]:
         yield from self._demand(SET_ZERO, bytes((self._channel,)))
+
+
+def _told(kind: bytes, rate: bytes) -> dict[str, float]:
+    """What the amplifier answers. Floats are set by the word 10h, and may be told as 10h or as the third type."""
+    (word,), (hertz,) = struct.unpack(">H", kind), struct.unpack(">f", rate)
+    return {TX_TYPE: float(TX_MODE["float32"] if word == THIRD_TYPE else word), DATA_RATE: float(hertz)}
 
 
 class _Recogniser:
