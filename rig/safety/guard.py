@@ -118,7 +118,8 @@ class Guard:
 
     @property
     def output_is_safe(self) -> bool:
-        """Whether the last two samples show it *measured* below 60 V, not rising, the channel off, no ramp under way.
+        """Whether the last two samples show it *measured* below 60 V, not rising, the channel off, no ramp under way,
+        and no more current than the film may leak.
 
         A low voltage alone proves nothing: an output that does not obey its off may be on its way up. Where there is a
         second reading, that too must show it.
@@ -219,6 +220,8 @@ class Guard:
             )
         if self.last is None or not self.output_is_safe:
             measured = "not measured yet" if self.last is None else f"{self.last.voltage:.0f} V"
+            if self.last is not None and self._draws(self.last):
+                measured += f" and drives {self.last.current * 1e6:.3g} uA (limits.leakage_uA)"
             raise FaultError(
                 f"hv: cannot be used, its output is {measured} though nobody switched it on from here. Nothing was "
                 "changed. Find out who did; take it down by hand; start again."
@@ -411,7 +414,7 @@ class Guard:
             self._second.on_supply(sample)
         below = abs(sample.voltage) < SAFE_VOLTAGE  # False for NaN
         rises = before is not None and abs(sample.voltage) > abs(before.voltage) + AWAY_V
-        off = below and not rises and not sample.flags & DRIVEN
+        off = below and not rises and not sample.flags & DRIVEN and not self._draws(sample)
         self._low_samples = self._low_samples + 1 if off else 0
         if self.commanded and not below:
             self._judge_frozen(sample)
@@ -427,6 +430,10 @@ class Guard:
             kind = Breakdown if faults & ARC else FaultError
             raise kind(f"hv: the supply reports {flag_names(faults)}.")
         self._judge_deviation(sample, before)
+
+    def _draws(self, sample: HVSample) -> bool:
+        """Whether more current flows than the film may leak: what is off drives none, whatever else is said of it."""
+        return self._supply.measures_current and sample.current > self._limits.leakage
 
     def on_monitor(self, sample: MonitorSample) -> None:
         """Judge one reading of the monitor. It can end a run and keep an output from counting as off, nothing else.

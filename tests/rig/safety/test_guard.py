@@ -367,3 +367,23 @@ def test_a_film_beyond_its_limits_is_cut_off_once_not_at_every_look() -> None:
     for k in range(20):
         guard.turn(0.1 + 0.1 * k)
     assert supply.words.count("emergency_off") == 1
+
+
+def test_an_output_that_is_called_off_and_drives_a_current_is_not_off() -> None:
+    guard, _, _ = live()
+    guard.kill("a test")
+    for _ in range(5):
+        guard.on_sample(sample(0.0, current=25e-6))
+    assert not guard.output_is_safe
+    for current in (0.0, -1e-7):
+        guard.on_sample(sample(0.0, current=current))
+    assert guard.output_is_safe
+
+
+def test_a_supply_that_is_found_so_is_not_armed() -> None:
+    guard, supply, _ = make()
+    for _ in range(5):
+        guard.on_sample(sample(0.0, current=25e-6))
+    with pytest.raises(FaultError, match="0 V and drives 25 uA"):
+        guard.arm()
+    assert supply.words == []
