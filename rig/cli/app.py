@@ -7,6 +7,7 @@ things inside the functions that use them, so that ``dea-rig --help`` answers at
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -156,3 +157,16 @@ def main() -> None:
     Start with `dea-rig demo`. Software is not the safety function: interlock, emergency stop, current limit and
     bleed resistor are.
     """
+    keep_streams()
+
+
+def keep_streams() -> None:
+    """Open what of standard input, output and error is closed, on nothing, for this program and those that it starts.
+
+    Else the next file that is opened gets that number, a port for one, and what is said to the operator goes there.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free: this one
