@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from calibration.film.branches.record import Bins, Record, correlation
+from calibration.film.branches.polygon import correlation
+from calibration.film.branches.record import Bins, Record
 from calibration.film.branches.response import Around, Relaxed, Response, Slopes, with_branches
 from calibration.film.coordinates import Coordinates
 from calibration.film.curve import Curve

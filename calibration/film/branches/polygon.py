@@ -1,0 +1,186 @@
+"""Histories as polygons: where values over time bend, and bins of time along the stretches between the bends.
+
+A history is solved along a polygon, because steps of time end where it bends. Bins are even, and grow in proportion to
+the time since the last bend, where a film relaxes in the logarithm of time.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SIGMAS = 5.5  # of its noise, by which a reading may lie off its polygon: one in 10^7
+EVEN, PER_DECADE = 16, 12  # bins of a stretch of a history: evenly, and in the logarithm of the time since it began
+FIRST = 2.0  # periods of the samples: the first of the latter
+MOST_BENDS = 400  # of a run
+MAD = 0.6745 * math.sqrt(6.0)  # of second differences of white noise, over its standard deviation
+
+
+def knots_of(t: Array, values: Sequence[Array], least: Sequence[float], period: float) -> Array:
+    """Times (s) at which any of the ``values`` bends; each may lie off its polygon by its ``least`` of its largest."""
+    bends: set[int] = set()
+    allowed = []
+    for one, part in zip(values, least, strict=True):
+        allowed.append(max(SIGMAS * _noise(one), part * float(one.max()), 1e-12))
+        bends |= set(_few_bends(t, one, allowed[-1]))
+    at = _apart(t, np.array(sorted(bends)), FIRST * period)
+    knots = _pruned(t, t[at], values, [0.25 * one for one in allowed])
+    return _sharpened(t, knots, values, allowed, 3.0 * period)
+
+
+def correlation(noise: Array, rows: NDArray[np.intp], most: int) -> float:
+    """How many samples carry the information of one independent one: ``1 + 2 sum_k rho_k`` of neighbours, at least 1.
+
+    As `calibration.film.reduction.correlation_time`; over no more than ``most`` samples, as bins are short.
+    """
+    total, time = float(noise @ noise), 1.0
+    if total <= 0.0:
+        return 1.0
+    for lag in range(1, most):
+        together = rows[lag:] - rows[:-lag] == lag
+        rho = float(noise[lag:] @ (noise[:-lag] * together)) / total
+        if rho < (3.0 if lag == 1 else 2.0) / math.sqrt(noise.size):
+            break
+        time += 2.0 * rho
+    return time
+
+
+def edges_of(length: float, period: float) -> Array:
+    """Ends of the bins of a stretch of that length (s), from its beginning."""
+    first = FIRST * period
+    even = np.linspace(0.0, length, EVEN + 1)[1:]
+    if length <= first * EVEN:
+        return np.linspace(0.0, length, max(2, int(length / first) + 1))[1:]
+    count = max(2, math.ceil(PER_DECADE * math.log10(length / first)) + 1)
+    both = np.unique(np.concatenate((np.geomspace(first, length, count), even)))
+    kept = [0.0]
+    for edge in both:
+        if edge - kept[-1] >= min(first, length):
+            kept.append(float(edge))
+    return np.array([*kept[1:-1], length])
+
+
+def lines_through(time: Array, mean: Array, segment: NDArray[np.intp], t: Array, number: NDArray[np.intp]) -> Array:
+    """The line through neighbouring bins of one stretch, at every sample."""
+    slope = np.zeros(time.size)
+    if time.size > 1:
+        rise, run = np.diff(mean), np.diff(time)
+        together = np.diff(segment) == 0
+        for side in (slice(None, -1), slice(1, None)):
+            slope[side] += np.where(together, rise / np.where(run > 0.0, run, 1.0), 0.0)
+        neighbours = np.zeros(time.size)
+        neighbours[:-1] += together
+        neighbours[1:] += together
+        slope /= np.maximum(neighbours, 1.0)
+    found: Array = mean[number] + slope[number] * (t - time[number])
+    return found
+
+
+def _noise(values: Array) -> float:
+    """Standard deviation of white noise on a curve; a value that rests at zero has none, and is left out."""
+    second = np.abs(np.diff(values, 2))[np.abs(values[1:-1]) > 0.02 * float(values.max())]
+    return float(np.median(second)) / MAD if second.size else 0.0
+
+
+def _few_bends(t: Array, values: Array, allowed: float) -> list[int]:
+    """`_bends`, of no more than `MOST_BENDS`: what has more follows its noise, and is allowed more."""
+    found = _bends(t, values, allowed)
+    while len(found) > MOST_BENDS:
+        allowed *= 1.5
+        found = _bends(t, values, allowed)
+    return found
+
+
+def _bends(t: Array, values: Array, allowed: float) -> list[int]:
+    """Ends and bends of the polygon that no value is farther off than ``allowed`` (Ramer, Douglas and Peucker)."""
+    found, todo = [0, t.size - 1], [(0, t.size - 1)]
+    while todo:
+        left, right = todo.pop()
+        if right - left < 2:
+            continue
+        part = slice(left, right + 1)
+        line = values[left] + (values[right] - values[left]) * (t[part] - t[left]) / (t[right] - t[left])
+        off = np.abs(values[part] - line)
+        worst = left + int(off.argmax())
+        if off[worst - left] > allowed and left < worst < right:
+            found.append(worst)
+            todo += [(left, worst), (worst, right)]
+    return found
+
+
+def _apart(t: Array, at: NDArray[np.intp], least: float) -> NDArray[np.intp]:
+    """Bends that are at least ``least`` (s) apart; the ends are kept."""
+    kept = [int(at[0])]
+    for k in at[1:]:
+        if t[k] - t[kept[-1]] >= least:
+            kept.append(int(k))
+    if kept[-1] != at[-1]:
+        kept[-1] = int(at[-1])
+    return np.array(kept)
+
+
+def _pruned(t: Array, knots: Array, values: Sequence[Array], allowed: list[float]) -> Array:
+    """Knots without those at which the polygons of all values bend by less than is ``allowed``."""
+    while knots.size > 2:
+        found = [through(t, one, knots) for one in values]
+        share = np.diff(knots)[:-1] / (knots[2:] - knots[:-2])
+        bend = np.zeros(knots.size - 2)
+        for one, most in zip(found, allowed, strict=True):
+            bend = np.maximum(bend, np.abs(one[1:-1] - one[:-2] - share * (one[2:] - one[:-2])) / most)
+        least = int(bend.argmin())
+        if bend[least] >= 1.0:
+            break
+        knots = np.delete(knots, least + 1)
+    return knots
+
+
+def _sharpened(t: Array, knots: Array, values: Sequence[Array], allowed: list[float], most: float) -> Array:
+    """Bends moved, by ``most`` (s) at most, to where the lines through the stretches beside them cross."""
+    first = np.searchsorted(t, knots)
+    lines: list[list[tuple[float, float]]] = []
+    for one in values:
+        mine = []
+        for left, right in itertools.pairwise(first):
+            rows = slice(left + 2, right - 2)
+            if right - left < 12:
+                mine.append((math.nan, math.nan))
+                continue
+            middle = float(t[rows].mean())
+            slope = float((t[rows] - middle) @ one[rows] / ((t[rows] - middle) ** 2).sum())
+            mine.append((slope, float(one[rows].mean()) - slope * middle))
+        lines.append(mine)
+    found = knots.copy()
+    for k in range(1, knots.size - 1):
+        span = min(knots[k] - knots[k - 1], knots[k + 1] - knots[k])
+        bends = [abs(mine[k][0] - mine[k - 1][0]) * span / one for mine, one in zip(lines, allowed, strict=True)]
+        if not np.isfinite(bends).any():
+            continue
+        mine = lines[int(np.nanargmax(bends))]
+        if mine[k][0] != mine[k - 1][0]:
+            cross = (mine[k - 1][1] - mine[k][1]) / (mine[k][0] - mine[k - 1][0])
+            if abs(cross - knots[k]) <= min(most, 0.3 * span):
+                found[k] = cross
+    return found
+
+
+def through(t: Array, values: Array, knots: Array) -> Array:
+    """Values at the knots of the polygon nearest to all values (least squares)."""
+    from scipy.linalg import solveh_banded
+
+    place = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
+    share = (t - knots[place]) / (knots[place + 1] - knots[place])
+    n = knots.size
+    own = np.bincount(place, (1.0 - share) ** 2, n) + np.bincount(place + 1, share**2, n)
+    beside = np.bincount(place, share * (1.0 - share), n)[: n - 1]
+    right = np.bincount(place, (1.0 - share) * values, n) + np.bincount(place + 1, share * values, n)
+    weak = 1e-6 * float(own.max())  # a stretch of a few samples keeps the readings at its ends
+    band = np.zeros((2, n))
+    band[0, 1:], band[1] = beside, own + weak
+    found: Array = solveh_banded(band, right + weak * np.interp(knots, t, values))
+    return found
