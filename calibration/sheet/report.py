@@ -16,9 +16,10 @@ from calibration.sheet.fit import Compared, TestsFit
 from calibration.sheet.problem import nominal_stress
 from calibration.sheet.sheet_tests import HomogeneousTest
 
-TEMPLATE = """<!doctype html>
+# What reports of sheets share: their beginning with the looks, and a table.
+STYLE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Homogeneous tests: {{ fit.law.title }}</title>
+<title>{{ title }}: {{ fit.law.title }}</title>
 <style>
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 1rem auto; padding: 0 1rem; color: #1a1a1a; }
 table { border-collapse: collapse; width: 100%; margin: 1rem 0; }
@@ -29,17 +30,23 @@ img { max-width: 100%; height: auto; } pre { white-space: pre-wrap; background: 
   tr { border-bottom: 1px solid #ccc; padding: .4rem 0; } td::before { content: attr(data-name) ": "; color: #555; } }
 @media print { body { max-width: none; } }
 </style></head><body>
-<h1>Homogeneous tests of a sheet</h1>
-<p>{{ fit.law.title }}{% if fit.law.series %}, {{ fit.mu|length }} terms{% endif %}, {{ fit.weighting }} weighting.
-{{ fit.law.description }}</p>
-{% for table in tables %}
+"""
+TABLE = """
 <h2>{{ table.title }}</h2>
 <table><thead><tr>{% for name in table.names %}<th>{{ name }}</th>{% endfor %}</tr></thead><tbody>
 {% for row in table.rows %}<tr>{% for cell in row %}<td data-name="{{ table.names[loop.index0] }}"
 {%- if cell in badges %} class="{{ badges[cell] }}"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table>
 {% if table.caption %}<p>{{ table.caption }}</p>{% endif %}
-{% endfor %}
+"""
+TEMPLATE = (
+    STYLE
+    + """<h1>Homogeneous tests of a sheet</h1>
+<p>{{ fit.law.title }}{% if fit.law.series %}, {{ fit.mu|length }} terms{% endif %}, {{ fit.weighting }} weighting.
+{{ fit.law.description }}</p>
+{% for table in tables %}"""
+    + TABLE
+    + """{% endfor %}
 <h2>Stress against stretch</h2>
 <img src="{{ curves }}" alt="Nominal stress against stretch, measured and fitted, one panel a kind of test">
 <h2>Residuals</h2>
@@ -52,6 +59,7 @@ img { max-width: 100%; height: auto; } pre { white-space: pre-wrap; background: 
 {% endfor %}</pre>
 </body></html>
 """
+)
 
 
 def write_report(
@@ -79,6 +87,7 @@ def render(fit: TestsFit, tests: Sequence[HomogeneousTest], compared: Sequence[C
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     tables = [_quantities(fit), _tests(fit), *([_compared(compared)] if compared else [])]
     return environment.from_string(TEMPLATE).render(
+        title="Homogeneous tests",
         fit=fit,
         tables=tables,
         badges={**BADGES, "not identifiable from this data": "bad"},

@@ -28,8 +28,24 @@ class TestsError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
+class TestHistory:
+    """All rows of a test with their times (s), whatever branch of it is fitted as elastic."""
+
+    __test__ = False
+
+    time: Array
+    stretch1: Array
+    stretch2: Array
+    stress1: Array
+    stress2: Array
+
+
+@dataclass(frozen=True, eq=False)
 class HomogeneousTest:
-    """Stretches and nominal stresses (Pa) of one test; ``stress2`` is nan where only the first was measured."""
+    """Stretches and nominal stresses (Pa) of one test; ``stress2`` is nan where only the first was measured.
+
+    ``history`` is there where the rows have a time: what a sheet that takes time is fitted to.
+    """
 
     name: str
     kind: str
@@ -37,6 +53,7 @@ class HomogeneousTest:
     stretch2: Array
     stress1: Array
     stress2: Array
+    history: TestHistory | None = None
 
     @property
     def measured(self) -> Array:

@@ -110,15 +110,10 @@ def identify_logs(
     records: list[Record] = []
     try:
         for run, scene in zip(runs, scenes, strict=True):
-            certificates = run.certificates
-            joining = registry.joining({phase.kind for phase in run.phases})
-            found = run.curves(scene.specimen.specimen(), joining, **_errors(run, scene, certificates))
-            corrected = [_without_compliance(curve, run, certificates) for curve in found]
-            inside = [_in_calibrated_range(_at_its_voltage(curve), certificates) for curve in corrected]
-            mine = [_with_drift(curve, certificates) for curve in inside]
+            mine = _curves_of(run, scene)
             curves += mine
             if branches and mine:
-                records.append(_record(run, mine[0], certificates))
+                records.append(_record(run, mine[0], run.certificates))
         if not curves:
             raise DataError("None of these logs holds a recorded curve: did the runs end before the first sweep?")
     except CurveError as error:
@@ -139,6 +134,38 @@ def identify_logs(
         **settings,
     )
     return replace(identified, runs=runs, truth=_truth(runs, scenes), notes=[*_notes(runs), *identified.notes])
+
+
+def _curves_of(run: Run, scene: Scene) -> list[Curve]:
+    """The recorded curves of a run with what is known of their errors."""
+    certificates = run.certificates
+    joining = registry.joining({phase.kind for phase in run.phases})
+    found = run.curves(scene.specimen.specimen(), joining, **_errors(run, scene, certificates))
+    corrected = [_without_compliance(curve, run, certificates) for curve in found]
+    inside = [_in_calibrated_range(_at_its_voltage(curve), certificates) for curve in corrected]
+    return [_with_drift(curve, certificates) for curve in inside]
+
+
+def read_records(paths: Sequence[Path]) -> list[Record]:
+    """The whole histories of logs.
+
+    Raises
+    ------
+    LogError, DataError
+        When a log cannot be read, or holds no recorded curve.
+    """
+    records = []
+    for path in paths:
+        run = load_run(path)
+        scene = parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)")
+        try:
+            curves = _curves_of(run, scene)
+            if not curves:
+                raise DataError(f"{path}: the log holds no recorded curve: did the run end before the first sweep?")
+            records.append(_record(run, curves[0], run.certificates))
+        except CurveError as error:
+            raise DataError(f"{error}.") from None
+    return records
 
 
 def identify_curves(

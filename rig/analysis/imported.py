@@ -14,6 +14,7 @@ from calibration.film.curve import CurveError
 from calibration.sheet.fit import Compared, TestsFit, compare_laws, fit_tests
 from calibration.sheet.problem import Weighting
 from calibration.sheet.sheet_tests import HomogeneousTest, TestsError
+from calibration.sheet.timed.record import stress_fallen
 from model.material.laws import known_laws
 from rig.analysis.film import UNKNOWN_LAG, Found, dimension_errors, identify_curves, law_called
 from rig.base.errors import ConfigError, DataError
@@ -133,9 +134,17 @@ def identify_sheets(read: SheetsRead, *, law: str = "ogden", **options: Any) -> 
         When there is no such law, or the tests cannot be fitted.
     """
     try:
-        return fit_tests(read.tests, predict=read.predict, law=law_called(law), **options)
+        found = fit_tests(read.tests, predict=read.predict, law=law_called(law), **options)
     except TestsError as error:
         raise DataError(f"{error}.") from None
+    for test in read.tests:
+        fallen = stress_fallen(test)
+        if fallen > 0.0:
+            found.warnings.append(
+                f"{test.name}: the stress falls by {fallen:.0%} of its largest where the sheet is held: it takes time, "
+                "and an elastic law is fitted to it all the same. --branches auto fits branches along"
+            )
+    return found
 
 
 def sheets_record(paths: Sequence[Path], predict: Sequence[Path], settings: Mapping[str, Any]) -> dict[str, Any]:

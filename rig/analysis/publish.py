@@ -32,6 +32,7 @@ METADATA, RESULT, README, DATA = "ro-crate-metadata.json", "result.json", "READM
 CONTEXT = ["https://w3id.org/ro/crate/1.1/context", {"sha256": "https://schema.org/sha256"}]
 PROFILE = "https://w3id.org/ro/crate/1.1"
 FILM, SHEET = "dea-rig identification 1", "dea-rig homogeneous tests 1"
+SHEET_OVER_TIME = "dea-rig homogeneous tests over time 1"
 MOST_BYTES = 64 * 1024 * 1024
 NO_TERMS = "No terms of use are stated: ask the authors."
 SAME = 1e-6  # relative: digits that another machine may give
@@ -77,7 +78,7 @@ def read_recipe(path: Path) -> Recipe:
     """
     result = parse_json(read_text(path, "result", MOST_BYTES), "result", str(path))
     try:
-        if result["format"] not in (FILM, SHEET):
+        if result["format"] not in (FILM, SHEET, SHEET_OVER_TIME):
             raise ValueError(f"its format is {result['format']!r}")
         record = result["provenance"]
         read = _film if result["format"] == FILM else _sheet
@@ -108,6 +109,7 @@ def _film(record: Mapping[str, Any], result: Mapping[str, Any]) -> tuple[list[In
     options += [word for name, value in settings["fixed"].items() for word in ("--fix", f"{name}={value!r}")]
     options += [word for key in settings["along"] for word in ("--along", key)]
     options += ["--negative-exponents"] if settings["negative_exponents"] else []
+    options += ["--branches", str(settings["branches"])] if "branches" in settings else []
     options += ["--profiles"] if settings["profiles"] else []
     options += ["--compare"] if "comparison" in result else []
     if settings["fixed_stretch"] is not None:
@@ -120,7 +122,10 @@ def _sheet(record: Mapping[str, Any], result: Mapping[str, Any]) -> tuple[list[I
     said = {one["file"]: one["options"] for one in result["import"]}
     inputs = [Input(Path(path), digest, "table", said[path]) for path, digest in record["tables"].items()]
     inputs += [Input(Path(path), digest, "predicted", said[path]) for path, digest in record["predicted"].items()]
-    options = ["--law", settings["law"], "--terms", str(settings["terms"]), "--weighting", settings["weighting"]]
+    options = ["--law", settings["law"], "--terms", str(settings["terms"])]
+    options += [
+        word for key in ("weighting", "branches") if key in settings for word in (f"--{key}", str(settings[key]))
+    ]
     options += [word for name, value in settings["fixed"].items() for word in ("--fix", f"{name}={value!r}")]
     options += [] if settings["negative_exponents"] else ["--positive-exponents"]
     return inputs, options

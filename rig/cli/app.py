@@ -24,6 +24,7 @@ HELPERS = {  # modules of this package that are no commands
     "fit_options",
     "import_options",
     "running",
+    "sheet_over_time",
     "show",
     "swapped",
     "talk",

@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from rig.cli.files import FILE, FOLDER, tell_written
-from rig.cli.fit_options import fix_option, fixed_values
+from rig.cli.fit_options import branches_wanted, fix_option, fixed_values
 from rig.cli.import_options import given, import_options, taken, understood_or_refused
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from calibration.film.result import Identification
 
 
+ELASTIC = "--compare, --posterior, --along and --permittivity charge"  # options that know no branches
 LEAST_SHARE = 0.01  # of a variance, for a line in the budget on screen
 
 
@@ -118,6 +119,7 @@ def command(
     if dry_run:
         tell_written(tidy)
         return
+    elastic = comparing or posterior or bool(along) or permittivity == "charge"
     with progress("Markov chains around the fit") if posterior else nullcontext(lambda *_: None) as update:
         settings: dict[str, Any] = {
             "law": law,
@@ -132,7 +134,7 @@ def command(
             "along": along,
             "each": each,
             "fixed_stretch": _stretches(stiffness_at),
-            "branches": _branches(branches, elastic=comparing or posterior or bool(along) or permittivity == "charge"),
+            "branches": branches_wanted(branches, ELASTIC if elastic else ""),
         }
         if tables is not None and scene is not None:
             found = identify_cones(tables, logs, scene, **settings)
@@ -214,22 +216,6 @@ def _stretches(words: str | None) -> tuple[float, float] | None:
             param_hint="--stiffness-at",
         )
     return meridional, hoop
-
-
-def _branches(words: str | None, *, elastic: bool) -> int | Literal["auto"]:
-    """How many branches; 0 without the option. Options that are of ``elastic`` films do not go with it."""
-    if words is None:
-        return 0
-    if elastic:
-        raise click.UsageError(
-            "--branches goes without --compare, --posterior, --along and --permittivity charge: those are of elastic "
-            "films."
-        )
-    if words.strip().lower() == "auto":
-        return "auto"
-    if words.strip() not in ("1", "2", "3"):
-        raise click.BadParameter(f"{words!r}: give 1, 2, 3, or auto", param_hint="--branches")
-    return int(words)
 
 
 def _check_source(paths: Sequence[Path], scene: Path | None, about_tables: bool) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rig.cli.files import FILE, tell_written
-from rig.cli.fit_options import fix_option, fixed_values
+from rig.cli.fit_options import branches_wanted, fix_option, fixed_values
 from rig.cli.import_options import import_options, taken, understood_or_refused, with_import
 
 if TYPE_CHECKING:
@@ -42,6 +42,19 @@ if TYPE_CHECKING:
     show_default=True,
     help="Whether an Ogden term may have alpha < 0 (with mu < 0).",
 )
+@click.option(
+    "--branches",
+    help="Sheets that take time: fit so many Maxwell branches along (1 to 3), or as many as pay: auto. Every table "
+    "needs a column of time.",
+)
+@click.option(
+    "--cone",
+    "cones",
+    multiple=True,
+    type=FILE,
+    help="Log of a cone whose force the sheet predicts, with --branches. May be repeated.",
+)
+@click.option("--film", type=FILE, help="Result of dea-rig fit -o: predict the TESTS from that film; no fit of them.")
 @click.option("--compare", "comparing", is_flag=True, help="Judge all laws: AICc, prediction of the other modes.")
 @click.option("--predict", multiple=True, type=FILE, help="A test that takes no part and is predicted.")
 @import_options(sheet=True)
@@ -54,6 +67,9 @@ def command(
     weighting: Any,
     fixed: tuple[str, ...],
     negative_exponents: bool,
+    branches: str | None,
+    cones: tuple[Path, ...],
+    film: Path | None,
     comparing: bool,
     predict: tuple[Path, ...],
     dry_run: bool,
@@ -66,12 +82,20 @@ def command(
     with columns of stretch, strain or extension, and of nominal stress or force. What is understood of each is printed
     first; what cannot be understood is asked for, with the option that tells it. A shared set of options can stand in
     DATA.import.toml beside DATA.csv. The kind of test is in the file, in its name, or in --kind.
+
+    With --branches all rows of relaxation and cyclic tests are fitted over time. --cone predicts the force of a cone
+    from the sheet, --film the sheet from a cone.
     """
     from rig.analysis.imported import compare_sheets, identify_sheets, read_sheets, sheets_record
     from rig.base.outputs import check_new, write_text
     from rig.cli.show import show
 
     check_new(out, report, tidy)
+    number = branches_wanted(branches, "--compare" if comparing else "")
+    if cones and number == 0:
+        raise click.UsageError("--cone goes with --branches: give --branches auto.")
+    if film is not None and (number or cones or comparing or predict):
+        raise click.UsageError("--film goes without --branches, --cone, --compare and --predict: it fits nothing.")
     read = understood_or_refused(lambda: read_sheets(tests, predict, taken(words)))
     if tidy is not None:
         from rig.importing.tidy import write_sheet_tests
@@ -80,6 +104,11 @@ def command(
     if dry_run:
         tell_written(tidy)
         return
+    if film is not None:
+        from rig.cli.sheet_over_time import predict_from_film
+
+        predict_from_film(read, film, out, report)
+        return
     settings: dict[str, Any] = {
         "law": law,
         "terms": terms,
@@ -87,6 +116,15 @@ def command(
         "fixed": fixed_values(fixed),
         "negative_exponents": negative_exponents,
     }
+    if number:
+        from rig.cli.sheet_over_time import fit_over_time
+
+        del settings["weighting"]
+        fit_over_time(
+            read, cones, settings | {"branches": number}, sheets_record(tests, predict, settings), out, report
+        )
+        tell_written(out, report, tidy)
+        return
     found = identify_sheets(read, **settings)
     compared = compare_sheets(read, weighting) if comparing else []
     if out is not None:

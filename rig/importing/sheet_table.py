@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.sheet.sheet_tests import HomogeneousTest
+from calibration.sheet.sheet_tests import HomogeneousTest, TestHistory
 from rig.importing.branches import jumps_of, legs_of, repeated_rows
 from rig.importing.columns import Chooser, Chosen, Part, read_columns
 from rig.importing.findings import Finding, Findings, refuse
@@ -27,6 +27,7 @@ LEAST_G, LARGEST_G = 1e3, 20e6  # Pa: elastomers lie between
 STRESS_AT_REST = 0.02  # of the largest stress, at stretch 1
 TOE = 0.02  # of the largest stress: until then a specimen hangs slack
 BROKEN = 0.5  # of the largest stress: less than that, with the stretch still rising, is a break
+TEAR, TEAR_ROWS = 0.9, 2  # of the stress, lost from row to row after next: a tear, where there is a time
 AGREE = 0.03  # by which stress and force over area, or strain and extension over length, may differ
 # A neo-Hookean sheet's nominal stress is G (l - l^p): the exponent p of each test.
 POWER = {"uniaxial": -2.0, "equibiaxial": -5.0, "pure shear": -3.0}
@@ -373,15 +374,23 @@ def _test(name: str, kind: str, part: Part, source: Source) -> HomogeneousTest |
             "repeated",
             f"{name}: {int(same.sum())} rows repeat the row before them; they are left out, for they tell nothing new",
         )
+    over_time = keep.copy() if "time" in values else None
     if kind != "biaxial":
         rows = np.flatnonzero(keep)
         keep[rows[~_branch(name, stretch[rows], stress[rows], part.lines[rows], source)]] = False
         stress = _look_at_curve(name, kind, stretch, stress, keep, part, source)
-    stretch1, stress1 = stretch[keep], stress[keep]
     if kind == "biaxial":
-        return HomogeneousTest(name, kind, stretch1, values["stretch2"][keep], stress1, values["stress2"][keep])
-    stretch2 = {"uniaxial": stretch1**-0.5, "equibiaxial": stretch1, "pure shear": np.ones_like(stretch1)}[kind]
-    return HomogeneousTest(name, kind, stretch1, stretch2, stress1, np.full_like(stress1, np.nan))
+        stretch2, stress2 = values["stretch2"], values["stress2"]
+    else:
+        stretch2 = {"uniaxial": stretch**-0.5, "equibiaxial": stretch, "pure shear": np.ones_like(stretch)}[kind]
+        stress2 = np.full_like(stress, np.nan)
+    columns = stretch, stretch2, stress, stress2
+    history = None
+    if over_time is not None:
+        over_time &= ~np.isin(part.lines, understood.left_out.get("after the break", [])) & np.isfinite(values["time"])
+        history = TestHistory(values["time"][over_time], *(one[over_time] for one in columns))
+    first, second, along, across = (one[keep] for one in columns)
+    return HomogeneousTest(name, kind, first, second, along, across, history)
 
 
 def _plausible(name: str, part: Part, findings: Findings) -> bool:
@@ -518,6 +527,8 @@ def _look_at_curve(
     top = int(rows[np.abs(stress[rows]).argmax()])
     after = rows[rows > top]
     fallen = after[np.abs(stress[after]) < BROKEN * largest]
+    if "time" in part.values:  # a sheet that is held relaxes
+        fallen = fallen[fallen >= _torn(np.abs(stress))]
     if fallen.size and abs(stretch[fallen[0]] - 1.0) >= 0.97 * abs(stretch[top] - 1.0):
         keep[after[after >= fallen[0]]] = False
         source.understood.left_out.setdefault("after the break", []).extend(
@@ -561,6 +572,13 @@ def _look_at_curve(
             "--unit stress=kPa",
         )
     return stress
+
+
+def _torn(stress: Array) -> int:
+    """The first row after a loss of `TEAR` of the stress within `TEAR_ROWS`; one past the last where there is none."""
+    before = stress[:-TEAR_ROWS]
+    lost = np.flatnonzero((stress[TEAR_ROWS:] < (1.0 - TEAR) * before) & (before > 0.1 * stress.max()))
+    return int(lost[0]) + 1 if lost.size else stress.size
 
 
 def _stress_at_rest(kind: str, stretch: Array, stress: Array) -> float | None:

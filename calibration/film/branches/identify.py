@@ -15,10 +15,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.joint import Joint
+from calibration.film.branches.joint import SOFTENING, Joint
 from calibration.film.branches.record import Record
-from calibration.film.branches.result import BranchCount, FoundBranch, Spectrum, Trace
-from calibration.film.branches.spectrum import FAR, USUAL, Count, Unseen, count_branches, covariance, misfit, unseen
+from calibration.film.branches.result import (
+    HOLD,
+    USUAL,
+    BranchCount,
+    FoundBranch,
+    Softening,
+    Spectrum,
+    Trace,
+    blind_times,
+)
+from calibration.film.branches.spectrum import Count, Unseen, count_branches, covariance, misfit, unseen
 from calibration.film.curve import Curve
 from calibration.film.differences import DIMENSIONS
 from calibration.film.identify import identify
@@ -40,9 +49,7 @@ from model.material.law import stack
 
 Array = NDArray[np.float64]
 
-KNOWN_RATIO, KNOWN_TIME = 0.15, 0.3  # relative standard uncertainties up to which a branch is identified
-EDGE = 0.1  # of the logarithm of a time, from the end of the window
-HOLD = 1.2  # times a relaxation time, that a film is held to see it
+FITTED_ALONG = NUISANCES | {SOFTENING: "1"}  # errors of the rig and of the film, by their unit
 
 
 def identify_branches(
@@ -84,7 +91,7 @@ def identify_branches(
             f"{branches} branches explain no more of these data than chance would, or would have to pull where the "
             "film pushes; give --branches auto"
         )
-    found = _Found(joint, tried)
+    found = _Found(joint, tried, branches)
     film = joint.coordinates.film(found.point.x)
     relaxed = found.relaxed(curves)
     base = identify(relaxed, near=[film], starts=1, **options)
@@ -94,8 +101,8 @@ def identify_branches(
 class _Found:
     """The joint fit at its end, and what follows from it."""
 
-    def __init__(self, joint: Joint, tried: Sequence[Count]) -> None:
-        self.joint, self.tried, self.point = joint, tried, tried[-1].point
+    def __init__(self, joint: Joint, tried: Sequence[Count], wanted: int | None) -> None:
+        self.joint, self.tried, self.point, self.wanted = joint, tried, tried[-1].point, wanted
         self.scale = misfit(joint, self.point)
         self.covariance = covariance(joint, self.point)
         self.response = self.covariance.response[:, : self.point.residual.size]
@@ -112,12 +119,16 @@ class _Found:
         for one, force, record in zip(self.joint.responses, self.forces, self.joint.records, strict=True):
             extra = force - one.elastic(self.material, one.fine)
             known = np.isfinite(extra)
-            added[record.run] = one.fine[known], extra[known]
+            added[record.run] = record, one.fine, known.astype(float), one.fine[known], extra[known]
         found = []
         for curve in curves:
             if curve.time is None or curve.run not in added:
                 raise IdentificationError(f"{curve.label}: its samples have no time; branches need it")
-            found.append(replace(curve, force=curve.force - np.interp(curve.time, *added[curve.run])))
+            record, fine, taut, times, extra = added[curve.run]
+            whole = curve.force / (1.0 - self.joint.softening(self.point.x, record, curve.time))
+            slack = np.interp(curve.time, fine, taut) < 1.0
+            flagged = slack if curve.flagged is None else curve.flagged | slack
+            found.append(replace(curve, force=whole - np.interp(curve.time, times, extra), flagged=flagged))
         return found
 
     def traces(self) -> tuple[Trace, ...]:
@@ -130,6 +141,7 @@ class _Found:
             sigma = self.joint.sigma[first : first + size]
             first += size
             there = np.searchsorted(response.fine, one.time)
+            left = 1.0 - self.joint.softening(self.point.x, record, one.time)
             found.append(
                 Trace(
                     run=record.run,
@@ -138,8 +150,8 @@ class _Found:
                     voltage=one.voltage,
                     measured=one.force,
                     deviation=sigma,
-                    model=force[there],
-                    relaxed=response.elastic(self.material, one.time),
+                    model=force[there] * left,
+                    relaxed=response.elastic(self.material, one.time) * left,
                     segment=one.segment,
                     moving=record.moving,
                 )
@@ -161,7 +173,7 @@ class _Found:
         parts = {"noise": float(np.linalg.norm(rows[:data]))}
         if self.scale > 1.0:
             parts["lack of fit"] = parts["noise"] * math.sqrt(self.scale - 1.0)
-        for kind in NUISANCES:
+        for kind in FITTED_ALONG:
             mine = [data + k for k, one in enumerate(self.joint.nuisances) if one.kind == kind]
             if mine:
                 parts[kind.replace("_", " ")] = float(np.linalg.norm(rows[mine]))
@@ -233,23 +245,25 @@ class _Found:
     def branches(self) -> tuple[FoundBranch, ...]:
         """Each with its verdict, the quickest first."""
         x, n, count = self.point.x, len(self.joint.coordinates.names), len(self.film.branches)
-        low, high = self.joint.window()
         found = []
         for k, one in enumerate(self.film.branches):
             units = np.eye(x.size)[[n + k, n + count + k]]
             ratio, log_time = (math.hypot(*self.budget(unit).values()) for unit in units)
-            inside = math.log(low) + EDGE < math.log(one.time) < math.log(high) - EDGE
-            if not inside:
-                word = "outside the window"
-            elif ratio <= KNOWN_RATIO * one.ratio and log_time <= KNOWN_TIME:
-                word = "identified"
-            else:
-                word = "bounded"
-            wide = min(1.96 * log_time, 50.0)
-            ratios = max(0.0, one.ratio - 1.96 * ratio), one.ratio + 1.96 * ratio
-            times = one.time * math.exp(-wide), one.time * math.exp(wide)
-            found.append(FoundBranch(one.ratio, ratio, one.time, log_time, word, ratios, times))
+            found.append(FoundBranch.judged(one.ratio, ratio, one.time, log_time, self.joint.window()))
         return tuple(sorted(found, key=lambda one: one.time))
+
+    def softening(self) -> tuple[Softening, ...]:
+        """What every cycle has left of the force, less than one for the cycles before."""
+        found, x = [], self.point.x
+        for record in self.joint.records:
+            slope = np.zeros(x.size)
+            for k, one in enumerate(self.joint.nuisances, start=x.size - len(self.joint.nuisances)):
+                run, _, cycle = one.run.rpartition(", cycle ")
+                if one.kind == SOFTENING and run == record.run:
+                    slope[k] = one.prior
+                    error = math.hypot(*self.budget(slope).values())
+                    found.append(Softening(run, int(cycle), float(slope @ x), error))
+        return tuple(found)
 
     def suspects(self, hidden: Sequence[Unseen]) -> list[Suspect]:
         """Further branches, as imperfections of the model."""
@@ -297,7 +311,7 @@ class _Found:
         deviation = np.sqrt(np.diag(matrix))
         deviation[deviation == 0.0] = 1.0
         spectrum = self._spectrum(base)
-        settings = {**base.provenance.get("settings", {}), "branches": len(self.film.branches)}
+        settings = {**base.provenance.get("settings", {}), "branches": self.wanted or "auto"}
         used = [record.errors for record in self.joint.records]
         return replace(
             base,
@@ -332,23 +346,21 @@ class _Found:
     def _nuisance(self) -> dict[str, RigParameter]:
         found, first = {}, self.point.x.size - len(self.joint.nuisances)
         for k, one in enumerate(self.joint.nuisances, start=first):
-            if one.kind in DIMENSIONS:
+            if one.kind in DIMENSIONS or (one.kind == SOFTENING and not self.joint.soften):
                 continue
             slope = np.eye(self.point.x.size)[k] * one.prior
             found[f"{one.kind.replace('_', ' ')} of {one.run}"] = RigParameter(
                 value=float(self.point.x[k] * one.prior),
                 uncertainty=math.hypot(*self.budget(slope).values()),
                 prior=one.prior,
-                unit=NUISANCES[one.kind],
+                unit=FITTED_ALONG[one.kind],
             )
         return found
 
     def _spectrum(self, base: Identification) -> Spectrum:
         low, high = self.joint.window()
         alone = unseen(self.joint, self.point, self.scale, alone=True)
-        late = [one.time for one in alone if one.time > high / 3.0 and not one.shows_from <= USUAL]
-        slow = _round_up(min(late, default=10.0 * high))
-        quick = max((one.time for one in alone if one.time < 0.03 * high and not one.shows_from <= FAR), default=0.0)
+        slow, quick = blind_times(((one.time, one.shows_from) for one in alone), high)
         rest = float(np.mean([record.errors.specimen.prestretch for record in self.joint.records]))
         return Spectrum(
             branches=self.branches(),
@@ -359,6 +371,7 @@ class _Found:
             hold=HOLD * slow,
             quick=quick,
             traces=self.traces(),
+            softening=self.softening() if self.joint.soften else (),
         )
 
 
@@ -377,9 +390,3 @@ def _widened(quantity: Quantity, like: Quantity) -> Quantity:
         budget={**quantity.budget, "other solutions": others},
         verdict=verdict(relative, quantity.at_bound),
     )
-
-
-def _round_up(seconds: float) -> float:
-    """The next of 1, 2, 5, 10, ... s."""
-    power = 10.0 ** math.floor(math.log10(seconds))
-    return next(one * power for one in (1.0, 2.0, 5.0, 10.0) if one * power >= 0.999 * seconds)

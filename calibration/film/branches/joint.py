@@ -24,6 +24,7 @@ from calibration.film.differences import DIMENSIONS, common, contrast_weights
 from calibration.film.systematic import SYSTEMATIC, stiffening
 from model.material.materials import Material
 from model.membrane.history import solve_histories
+from model.membrane.solve import Status
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,8 @@ LONG = 20  # samples of a bin from which its noise tells correlations
 INNER, OUTER = 12, 4  # steps of Newton's method between exact solutions; exact solutions at most
 SETTLED = 0.05  # decrease of chi-square that is none
 LOST = 1e6  # residual where the film has no state
+LEAST_KEPT = 0.5  # of the bins: a film that is taut at fewer is no film of this record
+SOFTENING, SOFTENS = "softening", 0.05  # by how much a film softens in its first cycle; in the k-th by 1/k of it
 
 
 @dataclass(frozen=True)
@@ -83,11 +86,22 @@ class Joint:
         self.peak = max(float(np.abs(one.force).max()) for one in self.bins)
         self.force = np.concatenate([one.force for one in self.bins])
         self.sigma, self.excess, self.correlation_time = self._weights(start)
-        self.samples = sum(int(one.size.sum()) for one in self.bins)
         self.nuisances = self._nuisances()
         self.correction: list[Array] = [np.zeros(one.time.size) for one in self.bins]
+        self.kept = np.ones(self.force.size, dtype=np.bool_)  # bins at which the film is taut, as far as is known
+        self.soften = False  # whether a softening of every cycle is fitted along
         self.around: list[Around] = []
         self.solved = 0  # exact histories
+
+    @property
+    def data(self) -> int:
+        """How many bins are held against the model."""
+        return int(self.kept.sum())
+
+    @property
+    def samples(self) -> int:
+        """How many samples these are of."""
+        return int(np.concatenate([one.size for one in self.bins])[self.kept].sum())
 
     # --- noise
 
@@ -127,6 +141,10 @@ class Joint:
         prior = max(record.errors.compliance_uncertainty for record in self.records)
         if prior > 0.0:
             found.append(Nuisance("compliance", "the rig", prior))
+        for record, bins in zip(self.records, self.bins, strict=True):
+            measured = record.cycle[bins.segment]
+            cycles = range(int(measured.min()) + 1, int(measured.max()) + 1) if measured.size else ()
+            found += [Nuisance(SOFTENING, f"{record.run}, cycle {k + 1}", SOFTENS / k) for k in cycles]
         for dimension in DIMENSIONS:
             weights = contrast_weights(self.curves, dimension)
             found += [Nuisance(dimension, f"contrast {k + 1}", 1.0) for k in range(len(weights))]
@@ -171,6 +189,8 @@ class Joint:
         """Entries that are fitted."""
         free = np.ones(x.size, dtype=np.bool_)
         free[: len(self.coordinates.names)] = [name not in self.held for name in self.coordinates.names]
+        if not self.soften:
+            free[x.size - len(self.nuisances) :] = [one.kind != SOFTENING for one in self.nuisances]
         return free
 
     # --- residuals
@@ -195,9 +215,10 @@ class Joint:
         residual = np.concatenate(((force - self.force) / self.sigma, errors))
         lost = ~np.isfinite(residual)
         residual[lost] = LOST
+        residual[: self.kept.size][~self.kept] = 0.0
         jacobian = np.concatenate(columns) / self.sigma[:, None]
         prior = np.eye(len(self.nuisances), x.size, x.size - len(self.nuisances))
-        jacobian = np.where(np.isfinite(jacobian), jacobian, 0.0)
+        jacobian = np.where(np.isfinite(jacobian) & self.kept[:, None], jacobian, 0.0)
         return Point(x, residual, np.concatenate((jacobian, prior)), slopes)
 
     def _columns(self, x: Array, one: Slopes, number: int, record: Record) -> Array:
@@ -217,6 +238,10 @@ class Joint:
             weights = contrast_weights(self.curves, nuisance.kind)
             found: Array = one.dimensions[nuisance.kind] * weights[int(nuisance.run.split()[-1]) - 1][number]
             return found
+        if nuisance.kind == SOFTENING:
+            run, _, cycle = nuisance.run.rpartition(", cycle ")
+            softer = record.cycle[bins.segment] >= int(cycle) - 1
+            return -one.force * softer * (run == record.run)
         if nuisance.kind == "force_zero":
             return np.full(bins.time.size, mine)
         # A move later or farther is answered by the film as stiff as it is at once.
@@ -238,16 +263,29 @@ class Joint:
         return found
 
     def exact(self, x: Array, point: Point) -> bool:
-        """Correct the model by the exact solution at ``x``; whether the film has a state everywhere."""
-        complete = True
-        for k, (one, force) in enumerate(zip(point.slopes, self.solve(x), strict=True)):
-            known = np.isfinite(force)
-            complete &= bool(known.all())
-            self.correction[k] = np.where(known, force - one.force, 0.0)
-        return complete
+        """Correct the model by the exact solution at ``x``; whether bins were left out where the film is not taut."""
+        forces = self.solve(x)
+        known = [np.isfinite(force) for force in forces]
+        for k, (one, force) in enumerate(zip(point.slopes, forces, strict=True)):
+            self.correction[k] = np.where(known[k], force - one.force, 0.0)
+        kept = self.kept & np.concatenate(known)
+        fewer = LEAST_KEPT * self.kept.size <= kept.sum() < self.kept.sum()
+        if fewer:
+            self.kept = kept
+        return bool(fewer)
+
+    def softening(self, x: Array, record: Record, times: Array) -> Array:
+        """Share of the force that the film has lost by the cycles before, at times (s) of a record."""
+        found, cycle = np.zeros(times.size), record.cycle_at(times)
+        errors = x[x.size - len(self.nuisances) :]
+        for one, size in zip(self.nuisances, errors, strict=True):
+            run, _, number = one.run.rpartition(", cycle ")
+            if one.kind == SOFTENING and run == record.run:
+                found += size * one.prior * (cycle >= int(number) - 1)
+        return found
 
     def solve(self, x: Array, *, fine: bool = False) -> list[Array]:
-        """Exact forces (N) of every record at its bins, or at its fine times; NaN where the film has no state."""
+        """Exact forces (N) of every record at its bins, or at its fine times; NaN where the film is not taut."""
         film = self.film(x)
         at = [one.fine if fine else one.bins.time for one in self.responses]
         self.solved += 1
@@ -255,7 +293,8 @@ class Joint:
             return [one.elastic(film, times) for one, times in zip(self.responses, at, strict=True)]
         specimens = [one.film(film) for one in self.responses]
         histories = [(one.t, one.h, one.voltage, times) for one, times in zip(self.responses, at, strict=True)]
-        return [one.force for one in solve_histories(specimens, histories, tolerance=TOLERANCE)]
+        found = solve_histories(specimens, histories, tolerance=TOLERANCE)
+        return [np.where(one.status == Status.TAUT, one.force, np.nan) for one in found]
 
     def systematic(self, point: Point) -> dict[str, Array]:
         """What one standard uncertainty of gains and dimensions does to the residuals, by its entry in the budget."""

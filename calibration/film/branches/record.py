@@ -8,6 +8,7 @@ time, so that neither the curvature of the force nor what the polygon leaves off
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 Elastic = Callable[[Array, Array], Array]  # force (N) at displacements (m) and voltages (V)
 
 LEAST_H, LEAST_V = 1.5e-3, 3e-3  # of the largest, by which it may lie off whatever the noise
+LOW, HIGH = 0.25, 0.5  # of the largest displacement, between which a cycle goes
 MOVED = 20.0  # noises of the displacement: less is a hold
 
 
@@ -112,6 +114,25 @@ class Record:
         noise = force - lines_through(time, mean_force, segment, t, number)
         return Bins(self, time, np.interp(time, knots, high), np.interp(time, knots, volts), mean_force + here,
                     size, segment, rows, number, noise)  # fmt: skip
+
+    @cached_property
+    def cycle(self) -> NDArray[np.intp]:
+        """Number of the cycle of each stretch between bends, from 0: one begins where the disk leaves its low place."""
+        _, high, _ = self.history
+        top = float(high.max())
+        number, been_up, found = 0, False, []
+        for left, right in itertools.pairwise(high):
+            if been_up and left < LOW * top and right > left:
+                number, been_up = number + 1, False
+            been_up |= right > HIGH * top
+            found.append(number)
+        return np.array(found, dtype=np.intp)
+
+    def cycle_at(self, times: Array) -> NDArray[np.intp]:
+        """Number of the cycle at these times (s)."""
+        knots, _, _ = self.history
+        found: NDArray[np.intp] = self.cycle[np.clip(np.searchsorted(knots, times, side="left") - 1, 0, knots.size - 2)]
+        return found
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:

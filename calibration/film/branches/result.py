@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,6 +13,11 @@ from numpy.typing import NDArray
 from calibration.film.result import Quantity, finite, quantity_dict
 
 Array = NDArray[np.float64]
+
+KNOWN_RATIO, KNOWN_TIME = 0.15, 0.3  # relative standard uncertainties up to which a branch is identified
+EDGE = 0.1  # of the logarithm of a time, from the end of the window
+HOLD = 1.2  # times a relaxation time, that a film is held to see it
+USUAL, FAR = 0.1, 0.5  # ratio of a branch that occurs; one that would not show below this ratio does not show
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,23 @@ class FoundBranch:
     verdict: str
     ratios: tuple[float, float]
     times: tuple[float, float]
+
+    @classmethod
+    def judged(
+        cls, ratio: float, ratio_uncertainty: float, time: float, time_relative: float, window: tuple[float, float]
+    ) -> FoundBranch:
+        """With its verdict and limits, from standard uncertainties and the times that the record can show (s)."""
+        low, high = window
+        if not math.log(low) + EDGE < math.log(time) < math.log(high) - EDGE:
+            word = "outside the window"
+        elif ratio_uncertainty <= KNOWN_RATIO * ratio and time_relative <= KNOWN_TIME:
+            word = "identified"
+        else:
+            word = "bounded"
+        wide = min(1.96 * time_relative, 50.0)
+        ratios = max(0.0, ratio - 1.96 * ratio_uncertainty), ratio + 1.96 * ratio_uncertainty
+        times = time * math.exp(-wide), time * math.exp(wide)
+        return cls(ratio, ratio_uncertainty, time, time_relative, word, ratios, times)
 
 
 @dataclass(frozen=True)
@@ -57,6 +81,19 @@ class Trace:
     moving: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Softening:
+    """By how much of its force a film has softened when a cycle of a run begins (Mullins), with standard uncertainty.
+
+    Cycles count from 1, those before the first measured one too; the law is that of the first measured one.
+    """
+
+    run: str
+    cycle: int
+    loss: float
+    uncertainty: float
+
+
 @dataclass(frozen=True, eq=False)
 class Spectrum:
     """What a record tells of a film's branches.
@@ -79,6 +116,8 @@ class Spectrum:
     quick : float
         A relaxation time (s) below which such a branch would not show either; 0 where there is none.
     traces : tuple of Trace
+    softening : tuple of Softening
+        Of every cycle after the first, where the record shows that the film softens; else empty.
     """
 
     branches: tuple[FoundBranch, ...]
@@ -89,6 +128,7 @@ class Spectrum:
     hold: float
     quick: float
     traces: tuple[Trace, ...] = ()
+    softening: tuple[Softening, ...] = ()
 
     @property
     def sentences(self) -> list[str]:
@@ -103,6 +143,11 @@ class Spectrum:
         if not self.branches:
             words.append("no branch is needed to explain this record")
         words.append(f"a branch of {self.slow:.0f} s would look like stiffness; hold {_minutes(self.hold)} to see it")
+        words += [
+            f"{one.run}: by cycle {one.cycle} the film has lost {100.0 * one.loss:.2g} % of its force, +- "
+            f"{100.0 * one.uncertainty:.1g} %; the law is that of the first one recorded"
+            for one in self.softening
+        ]
         if self.quick > 0.0:
             words.append(f"a branch of {self.quick:.2g} s would not show; move faster to see it")
         return words
@@ -128,8 +173,26 @@ class Spectrum:
             "looks_like_stiffness_from_s": self.slow,
             "hold_to_see_it_s": self.hold,
             "does_not_show_below_s": self.quick,
+            "softening": [asdict(one) for one in self.softening],
             "sentences": self.sentences,
         }
+
+
+def blind_times(alone: Iterable[tuple[float, float]], longest: float) -> tuple[float, float]:
+    """Times (s) from which on, and below which (0: none) a branch would not show.
+
+    ``alone`` has relaxation times (s) and from which ratio on each would be found; ``longest`` ends the window.
+    """
+    shown = list(alone)
+    late = [time for time, size in shown if time > longest / 3.0 and not size <= USUAL]
+    quick = [time for time, size in shown if time < 0.03 * longest and not size <= FAR]
+    return _round_up(min(late, default=10.0 * longest)), max(quick, default=0.0)
+
+
+def _round_up(seconds: float) -> float:
+    """The next of 1, 2, 5, 10, ... s."""
+    power = 10.0 ** math.floor(math.log10(seconds))
+    return next(one * power for one in (1.0, 2.0, 5.0, 10.0) if one * power >= 0.999 * seconds)
 
 
 def _minutes(seconds: float) -> str:

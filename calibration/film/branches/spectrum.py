@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.joint import Joint, Point
+from calibration.film.branches.joint import SOFTENING, Joint, Point
 from calibration.film.branches.response import with_branches
+from calibration.film.branches.result import FAR, USUAL
 from calibration.film.propagation import Covariance
 
 Array = NDArray[np.float64]
@@ -27,7 +28,6 @@ MOST = 3  # branches that are looked for
 PER_DECADE = 4  # relaxation times that a search tries
 GROUPS = 8  # parts of the records that are left out in turn
 ALMOST_SURE = 1.6449  # standard deviations that 95 of 100 stay below
-USUAL, FAR = 0.1, 0.5  # ratio of a branch that occurs; one that would not show below this ratio does not show
 DECADES_BEYOND = 1.3  # of the window, for branches that are not seen
 
 
@@ -100,7 +100,7 @@ def grid(joint: Joint, beyond: float) -> Array:
 
 def misfit(joint: Joint, point: Point) -> float:
     """Chi-square over its freedom where that is no chance, times how many bins err together; 1 where it is."""
-    data = point.residual[: joint.force.size]
+    data = point.residual[: joint.force.size][joint.kept]
     freedom = data.size - int(free_columns(joint, point)[: point.x.size - len(joint.nuisances)].sum())
     ratio = float(data @ data) / max(1, freedom)
     if not ratio > 1.0 + 3.0 * math.sqrt(2.0 / max(1, freedom)):
@@ -127,43 +127,86 @@ def held_out(joint: Joint, point: Point) -> float:
     free = free_columns(joint, point)
     columns, total = point.jacobian[:, free], 0.0
     count = joint.force.size
+    kept = joint.kept
     segments = np.concatenate([one.segment + 1000 * k for k, one in enumerate(joint.bins)])
-    order = np.unique(segments)
+    order = np.unique(segments[kept])
     for mine in np.array_split(order, min(GROUPS, order.size)):
         out = np.zeros(point.residual.size, dtype=np.bool_)
-        out[:count] = np.isin(segments, mine)
+        out[:count] = np.isin(segments, mine) & kept
         step = np.linalg.lstsq(columns[~out], -point.residual[~out], rcond=1e-10)[0]
         there = point.residual[out] + columns[out] @ step
         total += float(there @ there)
-    return math.sqrt(total / count)
+    return math.sqrt(total / joint.data)
 
 
 def count_branches(joint: Joint, start: Array, wanted: int | None) -> list[Count]:
     """The film with 0, 1, ... branches up to those that pay, or without and with as many as are ``wanted``.
 
-    The last one is the answer.
+    The last one is the answer. Where the forces look like a film that softens from cycle to cycle, the same is done
+    with a softening of every cycle fitted along, and taken if it pays as a branch must.
     """
-    elastic = joint.fit(start)
-    points = [elastic]
-    scale = 1.0
-    for number in range(1, (MOST if wanted is None else wanted) + 1):
-        fewer = points[-1]
-        corrected, around = [one.copy() for one in joint.correction], joint.around
-        point = _fitted(joint, points, number)
-        if point is None:
-            break
-        scale = misfit(joint, point)
-        pays = aicc(joint, point, scale) < aicc(joint, fewer, scale) - EARNED
-        pays &= held_out(joint, point) < PREDICTED * held_out(joint, fewer)
-        if wanted is None and not pays:
-            joint.correction, joint.around = corrected, around
-            break
-        points.append(point)
-    criteria = [aicc(joint, one, scale) for one in points]
-    return [
-        Count(joint.count(one.x), one, value - min(criteria), held_out(joint, one))
-        for one, value in zip(points, criteria, strict=True)
-    ]
+    plain = _Counting(joint, start, wanted)
+    terms = sum(one.kind == SOFTENING for one in joint.nuisances)
+    if terms and softens_perhaps(joint, plain.points[-1]):
+        before = joint.correction, joint.around, joint.kept
+        joint.soften = True
+        softened = _Counting(joint, start, wanted)
+        there, here = softened.points[-1], joint.evaluate(plain.points[-1].x)
+        scale = misfit(joint, there)
+        gain = aicc(joint, here, scale) - aicc(joint, there, scale) - 2.0 * terms
+        softer_by = [one.prior * (one.kind == SOFTENING) for one in joint.nuisances]
+        if gain > EARNED and float(there.x[there.x.size - len(softer_by) :] @ softer_by) > 0.0:
+            return softened.counts()
+        joint.soften = False
+        joint.correction, joint.around, joint.kept = before
+    return plain.counts()
+
+
+def softens_perhaps(joint: Joint, point: Point) -> bool:
+    """Whether a softening of every cycle would explain more of what a fit leaves over than chance does."""
+    first = point.x.size - len(joint.nuisances)
+    columns = [first + k for k, one in enumerate(joint.nuisances) if one.kind == SOFTENING]
+    free = free_columns(joint, point)
+    with_them = free.copy()
+    with_them[columns] = True
+    left = []
+    for chosen in (free, with_them):
+        part = point.jacobian[:, chosen]
+        rest = point.residual - part @ np.linalg.lstsq(part, point.residual, rcond=1e-10)[0]
+        left.append(float(rest @ rest))
+    return left[0] - left[1] > EARNED + 2.0 * len(columns)
+
+
+class _Counting:
+    """Fits with a rising number of branches."""
+
+    def __init__(self, joint: Joint, start: Array, wanted: int | None) -> None:
+        self.joint, self.points, self.scale = joint, [joint.fit(start)], 1.0
+        for number in range(1, (MOST if wanted is None else wanted) + 1):
+            corrected, around, kept = [one.copy() for one in joint.correction], joint.around, joint.kept
+            point = _fitted(joint, self.points, number)
+            if point is None:
+                break
+            if joint.kept is not kept:  # fewer bins: what was fitted to more is fitted again
+                self.points = [joint.evaluate(one.x) for one in self.points[:-1]] + [joint.fit(self.points[-1].x)]
+                point = joint.fit(point.x)
+            fewer = self.points[-1]
+            scale = misfit(joint, point)
+            pays = aicc(joint, point, scale) < aicc(joint, fewer, scale) - EARNED
+            pays &= held_out(joint, point) < PREDICTED * held_out(joint, fewer)
+            if wanted is None and not pays:
+                joint.correction, joint.around = corrected, around
+                break
+            self.scale = scale
+            self.points.append(point)
+
+    def counts(self) -> list[Count]:
+        """Each with its criteria."""
+        criteria = [aicc(self.joint, one, self.scale) for one in self.points]
+        return [
+            Count(self.joint.count(one.x), one, value - min(criteria), held_out(self.joint, one))
+            for one, value in zip(self.points, criteria, strict=True)
+        ]
 
 
 def _fitted(joint: Joint, points: Sequence[Point], number: int) -> Point | None:

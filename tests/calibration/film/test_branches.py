@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -156,3 +157,29 @@ def test_no_branch_is_found_in_an_elastic_film(seed: int) -> None:
     assert found.spectrum is not None
     assert found.spectrum.branches == ()
     assert abs(found.quantities["eps_r"].value - cone.eps_r) < 3.0 * found.quantities["eps_r"].uncertainty
+
+
+def softened(curves: list[Curve], losses: tuple[float, ...]) -> list[Curve]:
+    """The curves of a film that has lost so much of its force by each cycle."""
+    return [replace(curve, force=curve.force * (1.0 - loss)) for curve, loss in zip(curves, losses, strict=True)]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_film_that_softens_and_relaxes_is_told_apart() -> None:
+    """Both bias permittivity; holds tell the branch, equal cycles the softening. Told before it is believed."""
+    cone = ViscousCone(branches=((0.2, 8.0),), **ONE_TERM)
+    curves = run(cone, paper((0.0, 0.0, 1500.0), hold=15.0, speed=3e-3), 5)
+    losses = 0.0, 0.04, 0.055
+    given = softened(curves, losses)
+    found, _ = identify_branches(records(given), given, terms=1, branches=1)
+    assert found.spectrum is not None
+    assert [one.cycle for one in found.spectrum.softening] == [2, 3]
+    for one, loss in zip(found.spectrum.softening, losses[1:], strict=True):
+        assert abs(one.loss - loss) < 3.0 * one.uncertainty < 0.01
+    eps, stiff = found.quantities["eps_r"], found.quantities["stiffness_fixed"]
+    assert abs(eps.value - cone.eps_r) < 3.0 * eps.uncertainty < 0.06 * eps.value
+    assert abs(stiff.value - relaxed_stiffness(cone, found)) < 3.0 * stiff.uncertainty
+    (branch,) = found.spectrum.branches
+    assert abs(branch.ratio - 0.2) < 3.0 * branch.ratio_uncertainty
+    assert abs(math.log(branch.time / 8.0)) < 3.0 * branch.time_relative

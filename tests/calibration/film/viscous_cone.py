@@ -58,8 +58,8 @@ class ViscousCone:
         found: Array = np.array((2.0 * s1 - s2, 2.0 * s2 - s1)) / (6.0 * self.modulus) - w
         return found
 
-    def history(self, t: Sequence[float], h: Sequence[float], voltage: Sequence[float], moves: int = 60) -> Trace:
-        """Force along a piecewise linear history from rest, with ``moves`` steps in the shortest kind of stretch."""
+    def times(self, t: Sequence[float], moves: int) -> Array:
+        """Times of the steps of a piecewise linear history: so many evenly in each stretch, and so many early ones."""
         times = [np.array([t[0]])]
         shortest = min([time for _, time in self.branches], default=1.0)
         for left, right in itertools.pairwise(t):
@@ -67,7 +67,11 @@ class ViscousCone:
             even = np.linspace(0.0, length, moves + 1)[1:]
             early = np.geomspace(min(0.02 * shortest, length / moves), length, moves + 1)
             times.append(left + np.unique(np.concatenate((even, early))))
-        at = np.unique(np.round(np.concatenate(times), 6))
+        return np.unique(np.round(np.concatenate(times), 6))
+
+    def history(self, t: Sequence[float], h: Sequence[float], voltage: Sequence[float], moves: int = 60) -> Trace:
+        """Force along a piecewise linear history from rest, with ``moves`` steps in the shortest kind of stretch."""
+        at = self.times(t, moves)
         heights, volts = np.interp(at, t, h), np.interp(at, t, voltage)
         return Trace(at, heights, volts, self._march(at, heights, volts))
 

@@ -1,0 +1,1 @@
+"""Sheets that take time: relaxation and cyclic tests -> law and Maxwell branches."""
