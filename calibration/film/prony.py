@@ -15,12 +15,13 @@ FEBio     relaxed, with g0 = 1                 ``g_k = r_k``                    
 relax the stress in another way, and their branches rest in the undeformed film: stretch it first and let it rest.
 
 Sources: Abaqus Materials Guide, "Time domain viscoelasticity" (abaqus-docs.mit.edu/2017, simamat-c-timevisco:
-``g_R(t) = G_R(t)/G_0`` with the instantaneous ``G_0``; MODULI=LONG TERM says that the hyperelastic constants are those
-of ``G_inf``); Ansys Material Reference, "Viscoelasticity" (TB,PRONY; ``g_R(t) = g_inf + sum g_i e_i`` with ``g_R(0) =
-1``, so the hyperelastic constants are those at once; both also at polymerfem.com/mcalibration-prony-series);
-COMSOL Structural Mechanics Module User's Guide, theory of viscoelasticity (doc.comsol.com/6.0, sme_ug_theory.06.26: branches
-beside the main elastic branch; at large strain energy factors over it); FEBio, source of FEUncoupledViscoElasticMaterial
-(github.com/febiosoftware/FEBio: ``S = g0 S_e + sum g_i H_i``, ``g0 = 1`` unless given).
+``g_R(t) = G_R(t)/G_0`` with the instantaneous ``G_0``; MODULI=LONG TERM says that the hyperelastic constants are
+those of ``G_inf``); Ansys Material Reference, "Viscoelasticity" (TB,PRONY; ``g_R(t) = g_inf + sum g_i e_i`` with
+``g_R(0) = 1``, so the hyperelastic constants are those at once; both also at
+polymerfem.com/mcalibration-prony-series); COMSOL Structural Mechanics Module User's Guide, theory of viscoelasticity
+(doc.comsol.com/6.0, sme_ug_theory.06.26: branches beside the main elastic branch; at large strain energy factors over
+it); FEBio, source of FEUncoupledViscoElasticMaterial (github.com/febiosoftware/FEBio: ``S = g0 S_e + sum g_i H_i``,
+``g0 = 1`` unless given).
 """
 
 from __future__ import annotations
