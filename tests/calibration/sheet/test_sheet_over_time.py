@@ -66,6 +66,7 @@ def check(found: TimedFit, sheet: Sheet = SHEET) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_relaxation_and_cycles_give_law_and_branches() -> None:
     """Fitted to a uniaxial relaxation test and to one of two rates; what took no part is predicted."""
     tests = [made("uniaxial", relaxation(hold=100.0), 10.0, 3e-3, 1), made("uniaxial", cycles(count=1), 20.0, 3e-3, 2)]
@@ -79,6 +80,7 @@ def test_relaxation_and_cycles_give_law_and_branches() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_an_elastic_sheet_has_no_branch() -> None:
     sheet = Sheet(branches=())
     found = fit_timed([made("uniaxial", relaxation(hold=40.0), 10.0, 3e-3, 4, sheet)], terms=1)
@@ -87,6 +89,7 @@ def test_an_elastic_sheet_has_no_branch() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_a_test_that_begins_stretched_was_pulled_there_and_says_so() -> None:
     t, stretch, stress = table("uniaxial", relaxation(ramp=0.05, hold=60.0), 20.0, 2e-3)
     rows = t >= 0.05
@@ -128,6 +131,7 @@ def test_all_rows_of_a_table_with_time_are_kept_for_the_history(tmp_path: Path) 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_whole_command_on_tables_of_two_rates(tmp_path: Path) -> None:
     """Tables in, law with branches out: numbers in JSON, one page of HTML; and the sheets from the film's result."""
     relax = write(tmp_path / "uniaxial_relax.csv", table("uniaxial", relaxation(hold=100.0), 10.0, 3e-3, 1))
