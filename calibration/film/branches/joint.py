@@ -195,6 +195,15 @@ class Joint:
 
     # --- residuals
 
+    @property
+    def state(self) -> tuple[list[Array], list[Around]]:
+        """What the model was last corrected by: to be set again where another start led nowhere."""
+        return [one.copy() for one in self.correction], self.around
+
+    @state.setter
+    def state(self, to: tuple[list[Array], list[Around]]) -> None:
+        self.correction, self.around = to
+
     def settle(self, x: Array) -> None:
         """Take what changes little (`response.Around`) from the film at ``x``."""
         film = self.film(x)

@@ -147,18 +147,26 @@ def count_branches(joint: Joint, start: Array, wanted: int | None) -> list[Count
     """
     plain = _Counting(joint, start, wanted)
     terms = sum(one.kind == SOFTENING for one in joint.nuisances)
-    if terms and softens_perhaps(joint, plain.points[-1]):
-        before = joint.correction, joint.around, joint.kept
-        joint.soften = True
-        softened = _Counting(joint, start, wanted)
-        there, here = softened.points[-1], joint.evaluate(plain.points[-1].x)
-        scale = misfit(joint, there)
-        gain = aicc(joint, here, scale) - aicc(joint, there, scale) - 2.0 * terms
-        softer_by = [one.prior * (one.kind == SOFTENING) for one in joint.nuisances]
-        if gain > EARNED and float(there.x[there.x.size - len(softer_by) :] @ softer_by) > 0.0:
-            return softened.counts()
+    if not terms or not softens_perhaps(joint, plain.points[-1]):
+        return plain.counts()
+    state, kept = joint.state, joint.kept
+    joint.soften = True
+    softened = _Counting(joint, start, wanted)
+    here, there = plain.points[-1], softened.points[-1]
+    if joint.kept is not kept:
         joint.soften = False
-        joint.correction, joint.around, joint.kept = before
+        here = joint.fit(here.x)
+        state = joint.state
+        joint.soften = True
+        there = joint.fit(there.x)
+    scale = misfit(joint, there)
+    gain = aicc(joint, here, scale) - aicc(joint, there, scale) - 2.0 * terms
+    softer_by = [one.prior * (one.kind == SOFTENING) for one in joint.nuisances]
+    if gain > EARNED and float(there.x[there.x.size - len(softer_by) :] @ softer_by) > 0.0:
+        softened.points[-1] = there
+        return softened.counts()
+    joint.soften, joint.state = False, state
+    plain.points[-1] = here
     return plain.counts()
 
 
@@ -183,19 +191,21 @@ class _Counting:
     def __init__(self, joint: Joint, start: Array, wanted: int | None) -> None:
         self.joint, self.points, self.scale = joint, [joint.fit(start)], 1.0
         for number in range(1, (MOST if wanted is None else wanted) + 1):
-            corrected, around, kept = [one.copy() for one in joint.correction], joint.around, joint.kept
+            state, kept = joint.state, joint.kept
             point = _fitted(joint, self.points, number)
             if point is None:
+                joint.state = state
                 break
             if joint.kept is not kept:  # fewer bins: what was fitted to more is fitted again
-                self.points = [joint.evaluate(one.x) for one in self.points[:-1]] + [joint.fit(self.points[-1].x)]
+                self.points = [joint.fit(one.x) for one in self.points]
+                state = joint.state
                 point = joint.fit(point.x)
             fewer = self.points[-1]
             scale = misfit(joint, point)
             pays = aicc(joint, point, scale) < aicc(joint, fewer, scale) - EARNED
             pays &= held_out(joint, point) < PREDICTED * held_out(joint, fewer)
             if wanted is None and not pays:
-                joint.correction, joint.around = corrected, around
+                joint.state = state
                 break
             self.scale = scale
             self.points.append(point)
