@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ Array = NDArray[np.float64]
 
 TURN = 0.1  # of the range: smaller ways back are noise or settling
 JUMP = 0.1  # of the range, between two rows: a jump, if it is also many times the usual step
+TEAR, TEAR_ROWS = 0.9, 2  # of the stress, lost from row to row after next: a tear
 
 
 @dataclass(frozen=True)
@@ -112,3 +114,24 @@ def repeated_rows(*columns: Array) -> NDArray[np.bool_]:
     for column in columns:
         same[1:] &= column[1:] == column[:-1]
     return same
+
+
+def tear_of(stress: Array) -> int:
+    """The first row after a loss of `TEAR` of the stress within `TEAR_ROWS`; one past the last where there is none."""
+    before = stress[:-TEAR_ROWS]
+    lost = np.flatnonzero((stress[TEAR_ROWS:] < (1.0 - TEAR) * before) & (before > 0.1 * stress.max()))
+    return int(lost[0]) + 1 if lost.size else stress.size
+
+
+def hysteresis_of(stretch: Array, stress: Array, legs: Sequence[Leg]) -> float | None:
+    """Largest difference between the first two branches, in parts of the largest stress."""
+    first, second = legs[0], legs[1]
+    one = slice(first.start, first.stop)
+    two = slice(second.start, second.stop)
+    order = np.argsort(stretch[two])
+    x, y = stretch[two][order], stress[two][order]
+    inside = (stretch[one] >= x[0]) & (stretch[one] <= x[-1])
+    largest = float(np.abs(stress).max())
+    if not inside.any() or not largest > 0.0:
+        return None
+    return float(np.abs(stress[one][inside] - np.interp(stretch[one][inside], x, y)).max()) / largest

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.sheet.sheet_tests import HomogeneousTest, TestHistory
-from rig.importing.branches import jumps_of, legs_of, repeated_rows
+from rig.importing.branches import hysteresis_of, jumps_of, legs_of, repeated_rows, tear_of
 from rig.importing.columns import Chooser, Chosen, Part, read_columns
 from rig.importing.findings import Finding, Findings, refuse
 from rig.importing.headings import fold
@@ -27,7 +27,6 @@ LEAST_G, LARGEST_G = 1e3, 20e6  # Pa: elastomers lie between
 STRESS_AT_REST = 0.02  # of the largest stress, at stretch 1
 TOE = 0.02  # of the largest stress: until then a specimen hangs slack
 BROKEN = 0.5  # of the largest stress: less than that, with the stretch still rising, is a break
-TEAR, TEAR_ROWS = 0.9, 2  # of the stress, lost from row to row after next: a tear, where there is a time
 AGREE = 0.03  # by which stress and force over area, or strain and extension over length, may differ
 # A neo-Hookean sheet's nominal stress is G (l - l^p): the exponent p of each test.
 POWER = {"uniaxial": -2.0, "equibiaxial": -5.0, "pure shear": -3.0}
@@ -469,7 +468,7 @@ def _branch(name: str, stretch: Array, stress: Array, lines: NDArray[np.intp], s
     chosen = np.zeros(stretch.size, dtype=np.bool_)
     for leg in wanted:
         chosen[leg.start : leg.stop] = True
-    gap = _hysteresis(stretch, stress, legs)
+    gap = hysteresis_of(stretch, stress, legs)
     findings.warning(
         "cycles",
         f"{name}: {len(loading)} loading and {len(legs) - len(loading)} unloading branches (load cycles"
@@ -479,20 +478,6 @@ def _branch(name: str, stretch: Array, stress: Array, lines: NDArray[np.intp], s
     )
     source.understood.left_out.setdefault("other branches of the load cycles", []).extend(lines[~chosen].tolist())
     return chosen
-
-
-def _hysteresis(stretch: Array, stress: Array, legs: Sequence[object]) -> float | None:
-    """Largest difference between the first two branches, in parts of the largest stress."""
-    first, second = legs[0], legs[1]
-    one = slice(first.start, first.stop)  # type: ignore[attr-defined]
-    two = slice(second.start, second.stop)  # type: ignore[attr-defined]
-    order = np.argsort(stretch[two])
-    x, y = stretch[two][order], stress[two][order]
-    inside = (stretch[one] >= x[0]) & (stretch[one] <= x[-1])
-    largest = float(np.abs(stress).max())
-    if not inside.any() or not largest > 0.0:
-        return None
-    return float(np.abs(stress[one][inside] - np.interp(stretch[one][inside], x, y)).max()) / largest
 
 
 def _look_at_curve(
@@ -528,7 +513,7 @@ def _look_at_curve(
     after = rows[rows > top]
     fallen = after[np.abs(stress[after]) < BROKEN * largest]
     if "time" in part.values:  # a sheet that is held relaxes
-        fallen = fallen[fallen >= _torn(np.abs(stress))]
+        fallen = fallen[fallen >= tear_of(np.abs(stress))]
     if fallen.size and abs(stretch[fallen[0]] - 1.0) >= 0.97 * abs(stretch[top] - 1.0):
         keep[after[after >= fallen[0]]] = False
         source.understood.left_out.setdefault("after the break", []).extend(
@@ -572,13 +557,6 @@ def _look_at_curve(
             "--unit stress=kPa",
         )
     return stress
-
-
-def _torn(stress: Array) -> int:
-    """The first row after a loss of `TEAR` of the stress within `TEAR_ROWS`; one past the last where there is none."""
-    before = stress[:-TEAR_ROWS]
-    lost = np.flatnonzero((stress[TEAR_ROWS:] < (1.0 - TEAR) * before) & (before > 0.1 * stress.max()))
-    return int(lost[0]) + 1 if lost.size else stress.size
 
 
 def _stress_at_rest(kind: str, stretch: Array, stress: Array) -> float | None:
