@@ -44,7 +44,7 @@ class Input:
 
     path: Path
     sha256: str
-    role: str  # "log", "table", "predicted" or "scene"
+    role: str  # "log", "table", "predicted", "cone" or "scene"
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -62,7 +62,7 @@ class Recipe:
         """The command line, with the inputs at ``places``."""
         at = list(zip(self.inputs, map(str, places), strict=True))
         found = [self.command, *(place for one, place in at if one.role in ("log", "table"))]
-        for option, role in (("--scene", "scene"), ("--predict", "predicted")):
+        for option, role in (("--scene", "scene"), ("--predict", "predicted"), ("--cone", "cone")):
             for one, place in at:
                 found += [option, place] if one.role == role else []
         return [*found, *self.options]
@@ -122,6 +122,7 @@ def _sheet(record: Mapping[str, Any], result: Mapping[str, Any]) -> tuple[list[I
     said = {one["file"]: one["options"] for one in result["import"]}
     inputs = [Input(Path(path), digest, "table", said[path]) for path, digest in record["tables"].items()]
     inputs += [Input(Path(path), digest, "predicted", said[path]) for path, digest in record["predicted"].items()]
+    inputs += [Input(Path(path), digest, "cone") for path, digest in record.get("cones", {}).items()]
     options = ["--law", settings["law"], "--terms", str(settings["terms"])]
     options += [
         word for key in ("weighting", "branches") if key in settings for word in (f"--{key}", str(settings[key]))
