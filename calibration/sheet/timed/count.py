@@ -27,6 +27,8 @@ from calibration.sheet.timed.problem import Point, TimedProblem
 
 Array = NDArray[np.float64]
 
+CLEAR = 60.0  # of AICc: a gain that no unfinished search explains
+
 
 @dataclass(frozen=True, eq=False)
 class Count:
@@ -121,6 +123,13 @@ def guess(problem: TimedProblem, from_: Point, number: int) -> Array | None:
     return found
 
 
+def _pays(problem: TimedProblem, fewer: Point, more: Point) -> tuple[float, bool]:
+    """The misfit of the richer fit, and whether its branch is earned."""
+    scale = misfit(problem, more)
+    earned = aicc(problem, more, scale) < aicc(problem, fewer, scale) - EARNED
+    return scale, earned and held_out(problem, more) < PREDICTED * held_out(problem, fewer)
+
+
 def count_branches(problem: TimedProblem, start: Array, wanted: int | None) -> list[Count]:
     """The sheet with 0, 1, ... branches up to those that pay, or without and with as many as are ``wanted``."""
     points = [problem.minimise(start)]
@@ -131,9 +140,15 @@ def count_branches(problem: TimedProblem, start: Array, wanted: int | None) -> l
         if begin is None:
             break
         point = problem.minimise(begin)
-        found = misfit(problem, point)
-        pays = aicc(problem, point, found) < aicc(problem, fewer, found) - EARNED
-        pays &= held_out(problem, point) < PREDICTED * held_out(problem, fewer)
+        found, pays = _pays(problem, fewer, point)
+        if pays and aicc(problem, fewer, found) - aicc(problem, point, found) < CLEAR:
+            # A valley that was left half way looks like a gain: both to their ends, the one with less from the other.
+            film = problem.split(point.x)[0]
+            other = np.concatenate((film, fewer.x[film.size :]))
+            ends = [problem.minimise(start, last=True) for start in (fewer.x, other)]
+            points[-1] = fewer = min(ends, key=lambda one: one.cost)
+            point = problem.minimise(point.x, last=True)
+            found, pays = _pays(problem, fewer, point)
         if wanted is None and not pays:
             break
         scale = found
