@@ -142,7 +142,7 @@ def test_the_whole_command_on_tables_of_two_rates(tmp_path: Path) -> None:
     done = CliRunner().invoke(main, [*words, "-o", str(out), "--report", str(page)])
     assert done.exit_code == 0, done.output
     found = json.loads(out.read_text())
-    assert [one["verdict"] for one in found["spectrum"]["branches"]] == ["identified", "identified"]
+    assert [one["verdict"] for one in found["spectrum"]["branches"]] == ["identified", "identified"], done.output
     for one, (ratio, time) in zip(found["spectrum"]["branches"], SHEET.branches, strict=True):
         assert one["ratio"] == pytest.approx(ratio, abs=3.0 * one["ratio_standard_uncertainty"])
         assert one["time_s"] == pytest.approx(time, rel=3.0 * one["time_relative_standard_uncertainty"])
