@@ -27,6 +27,7 @@ import math
 import re
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import suppress
 from typing import ClassVar, Literal, TypeVar
 
 from pydantic import Field
@@ -292,6 +293,9 @@ class Shvps:
             self._dialogue.run(now)
         except DeviceLost:
             self._next_poll = now + LOST_AGAIN_S
+            if self._emergency:  # a line that gives nothing any more may still take something
+                with suppress(DeviceError):
+                    self._write_off()
             raise
         except DeviceError:
             self._next_poll = now
@@ -472,8 +476,7 @@ class Shvps:
 
     def _emergency_off(self) -> Script[str, str]:
         try:
-            for request in ("SSwMode 0", "SVset 0"):  # both are on their way before anything is waited for
-                self._link.write(encode(request))
+            self._write_off()
             # What was asked before may still be answered, by a version too; only the name comes after all that.
             yield Ask("QName")
             yield from self._set("SwMode", OFF)
@@ -481,6 +484,11 @@ class Shvps:
         except DeviceError as error:
             raise type(error)(self._label, f"EMERGENCY OFF IS NOT CONFIRMED ({error.what})", _UNSAFE) from error
         self._on, self._setpoint = False, 0
+
+    def _write_off(self) -> None:
+        """Both are on their way before anything is waited for."""
+        for request in ("SSwMode 0", "SVset 0"):
+            self._link.write(encode(request))
 
     def _command(self, script: Script[str, str]) -> None:
         self._commands += 1

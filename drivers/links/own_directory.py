@@ -27,7 +27,7 @@ def user_directory() -> Path:
     """
     user = user_number()
     for base in (os.environ.get("XDG_RUNTIME_DIR"), os.environ.get("LOCALAPPDATA"), f"/run/user/{user}"):
-        if not base or not Path(base).is_dir():
+        if not base or not _is_users(Path(base), user):  # another user's, by sudo for one, is left alone
             continue
         folder = Path(base) / NAME
         with contextlib.suppress(OSError):
@@ -36,7 +36,10 @@ def user_directory() -> Path:
             return folder
     import tempfile  # it takes longer than all the rest
 
-    temporary = Path(tempfile.gettempdir())
+    try:
+        temporary = Path(tempfile.gettempdir())
+    except FileNotFoundError:  # which would mean that the directory has gone meanwhile
+        raise OSError(0, "no directory for temporary files can be written; set TMPDIR to one that can") from None
     existing = _ours_in(temporary, user)
     if existing is None:
         tempfile.mkdtemp(prefix=f"{NAME}-{user}-", dir=temporary)
@@ -54,6 +57,13 @@ def remove_if_empty(folder: Path) -> None:
 
 def _ours_in(temporary: Path, user: int) -> Path | None:
     return min((one for one in temporary.glob(f"{NAME}-{user}-*") if _is_ours(one, user)), default=None)
+
+
+def _is_users(base: Path, user: int) -> bool:
+    try:
+        return base.is_dir() and (os.name != "posix" or base.stat().st_uid == user)
+    except OSError:
+        return False
 
 
 def _is_ours(folder: Path, user: int) -> bool:

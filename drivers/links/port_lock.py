@@ -56,7 +56,9 @@ class PortLock:
                 continue
             except OSError as error:
                 raise DeviceError(
-                    device, f"the lock file of port {port} cannot be opened ({error.strerror or error})", "Remove it."
+                    device,
+                    f"the lock file of port {port} cannot be opened ({error.strerror or error})",
+                    "Remove it, or give this user a directory of its own (XDG_RUNTIME_DIR, TMPDIR).",
                 ) from None
             try:
                 lock(fd)
