@@ -27,19 +27,22 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import Array
 from model.material.materials import Branch
 from model.membrane import refinement, ritz
-from model.membrane.march import Course, Step, Trail, flat_guess, goal, march, unpack
+from model.membrane.march import Course, How, Step, Trail, flat_guess, march
 from model.membrane.output import fine_table
 from model.membrane.refinement import ROUND_OFF_TENSION
-from model.membrane.solve import Status, solve_many
-from model.membrane.viscous import Films, Instant, balance, slopes
+from model.membrane.solve import Status, Wrinkling, solve_many
+from model.membrane.viscous import Balance, balance, slopes
+from model.membrane.viscous_films import Films, Instant, PushLaw, unpack
 from model.specimen import Specimen
 
 MORE_MODES = 2  # than an elastic film of the same tolerance: the viscous strain is a field of its own
 FEW = 5  # answers within a step that are solved each; of more, so many are solved at first
 MOST_NODES = 65
+LEAST_SCALE = 1e-12  # dimensionless force or height over which errors are meant where there is none
 CHUNK = 256  # states that are solved at once
 LEAST_SHARE = 0.05  # of the tolerance: no less is stated of an error, for between steps it is not that of their ends
-PEAK, HOOP, MERIDIONAL = 1, 2, 3  # rows of an answer, after the force
+PEAK, HOOP, MERIDIONAL, FOLDED, ROWS = 1, 2, 3, 4, 5  # rows of an answer, after the force; how many before derivatives
+FOLDED_PIECES = (3, 6)  # times as many elements for folded films, for an answer to judge the other by and for it
 
 
 @dataclass(frozen=True)
@@ -49,17 +52,22 @@ class History:
     Attributes
     ----------
     force : F (N), positive when it pushes the disk to positive h
+    h : displacement of the disk (m)
     peak_field : largest true field (V/m)
     min_hoop_stress, min_meridional_stress : smallest true stresses (Pa)
     status : `model.membrane.solve.Status` numbers
-    error_estimate : estimated error of the force over the largest force of the history
+    error_estimate : estimated error of the force over the largest force of the history; of a free disk that of its
+        displacement over the largest
     steps, rejected : steps of time taken, and tried in vain
     dforce : derivatives of the force by "mu" (times, moduli), "alpha" (times, shape parameters), "eps_r" (times,),
         "ratio", "time" (times, branches), "thickness", "prestretch", and "h", a shift of the whole history of
         displacement; None unless asked for
+    dh : of a free disk in its place the derivatives of the displacement, "load" (m over the load's relative change) in
+        place of "h"
     """
 
     force: Array
+    h: Array
     peak_field: Array
     min_hoop_stress: Array
     min_meridional_stress: Array
@@ -68,6 +76,7 @@ class History:
     steps: int
     rejected: int
     dforce: dict[str, Array] | None = None
+    dh: dict[str, Array] | None = None
 
 
 def solve_history(
@@ -79,6 +88,7 @@ def solve_history(
     *,
     tolerance: float = 1e-6,
     sensitivities: bool = False,
+    wrinkling: Wrinkling = "plain",
 ) -> History:
     """Force along a history, from a film rested flat in its pre-stretched state at ``t[0]``.
 
@@ -90,6 +100,8 @@ def solve_history(
     times : where the answer is wanted, within ``t``; at ``t`` itself when not given
     tolerance : error of the force to aim for, over the largest force of the history: 1e-10 to 1e-2
     sensitivities : also give ``dforce``, for about twice the cost; their error is some tolerances, relative
+    wrinkling : "plain": the plain equations even where the hoop stress is negative; "tension_field": the relaxed
+        energy, of which the natural width makes all stress, that of the branches too. Both say WRINKLED there
 
     Returns
     -------
@@ -99,7 +111,10 @@ def solve_history(
     ------
     ValueError : the history is no history, or times lie outside it
     """
-    return solve_histories([specimen], [(t, h, voltage, times)], tolerance=tolerance, sensitivities=sensitivities)[0]
+    found = solve_histories(
+        [specimen], [(t, h, voltage, times)], tolerance=tolerance, sensitivities=sensitivities, wrinkling=wrinkling
+    )
+    return found[0]
 
 
 def solve_histories(
@@ -108,6 +123,8 @@ def solve_histories(
     *,
     tolerance: float = 1e-6,
     sensitivities: bool = False,
+    wrinkling: Wrinkling = "plain",
+    push: PushLaw | None = None,
 ) -> list[History]:
     """`solve_history` of many films at once: each takes its own steps, for a fraction of the cost apart.
 
@@ -115,7 +132,9 @@ def solve_histories(
     ----------
     specimens : the films, one a history
     histories : ``(t, h, voltage, times)`` of each, as in `solve_history`
-    tolerance, sensitivities : as in `solve_history`
+    tolerance, sensitivities, wrinkling : as in `solve_history`
+    push : the loads of disks that are free to move, force (N) and slope (N/m) by the film's number and h (m), not
+        negative; ``h`` of the histories is then the share of it, 0 or more (`model.actuator.creep`)
 
     Returns
     -------
@@ -130,29 +149,72 @@ def solve_histories(
     checked = [_checked(*one, tolerance) for one in histories]
     if not sensitivities:
         specimens = [_bare(one) for one in specimens]
-    columns = [_columns(one) if sensitivities else 0 for one in specimens]
-    answers = [_Answer.empty(len(one[1]), count) for one, count in zip(checked, columns, strict=True)]
-    lost: dict[int, tuple[float, Status]] = {}
+    how = How(tolerance, sensitivities, push, wrinkling == "tension_field")
+    courses, times = [course for course, _ in checked], [asked for _, asked in checked]
     with np.errstate(all="ignore"):
-        largest = _elastic(specimens, [course for course, _ in checked])
-        for modes, mine in _alike(specimens, tolerance):
-            films = Films.of([specimens[k] for k in mine], modes)
-            courses, times = [checked[k][0] for k in mine], [checked[k][1] for k in mine]
-            scale = np.where(largest[mine] > 0.0, largest[mine] / films.unit, 1e-12)
-            trail = march(films, courses, scale, tolerance, sensitivities)
-            some = [answers[k] for k in mine]
-            for place, k in enumerate(mine):
-                answers[k].scale = float(scale[place] * films.unit[place])
-                answers[k].steps = int(trail.taken[place]), int(trail.rejected[place])
-            lost |= {mine[place]: how for place, how in trail.lost.items()}
-            _Reader(films, courses, trail, times, some, goal(tolerance, sensitivities), tolerance * scale).read()
-    return [answers[k].history(specimen, *checked[k], lost.get(k), tolerance) for k, specimen in enumerate(specimens)]
+        largest = _elastic(specimens, courses) if push is None else np.zeros(len(specimens))
+        company = _Company(specimens, courses, times, largest, how)
+        for modes, pieces, mine in _alike(specimens, tolerance):
+            answers, folded = company.solve(mine, modes, pieces)
+            for k, answer in zip(mine, answers, strict=True):
+                company.answers[k] = answer
+            if folded:
+                for k, answer in zip(folded, company.solve_folded(folded, modes, pieces), strict=True):
+                    company.answers[k] = answer
+    return [company.history(k) for k in range(len(specimens))]
 
 
-def _columns(specimen: Specimen) -> int:
-    """`Films.columns` of a film."""
-    material = specimen.material
-    return len(material.mu) + len(material.alpha) + 2 * len(material.branches) + 3
+class _Company:
+    """Histories that are solved together, by their numbers."""
+
+    def __init__(
+        self,
+        specimens: Sequence[Specimen],
+        courses: Sequence[Course],
+        times: Sequence[Array],
+        largest: Array,
+        how: How,
+    ) -> None:
+        self.specimens, self.courses, self.times, self.largest, self.how = specimens, courses, times, largest, how
+        self.answers: dict[int, _Answer] = {}
+
+    def history(self, k: int) -> History:
+        """The answers of history ``k`` with their units."""
+        how, push = self.how, self.how.push
+        if push is not None:
+            how = replace(how, push=lambda which, h: push(np.full_like(which, k), h))
+        return self.answers[k].history(self.specimens[k], self.courses[k], self.times[k], how)
+
+    def solve(self, mine: Sequence[int], modes: int, pieces: int) -> tuple[list[_Answer], list[int]]:
+        """Answers of ``mine``, and those that were folded at some time."""
+        films = Films.of([self.specimens[k] for k in mine], modes, pieces)
+        courses, times = [self.courses[k] for k in mine], [self.times[k] for k in mine]
+        scale = np.where(self.largest[mine] > 0.0, self.largest[mine] / films.unit, LEAST_SCALE)
+        how, push, numbers = self.how, self.how.push, np.array(mine)
+        if push is not None:
+            how = replace(how, push=lambda which, h: push(numbers[which], h))
+        trail = march(films, courses, scale, how)
+        answers = [_Answer.empty(len(one), films.columns if how.sensitivities else 0) for one in times]
+        unit = films.unit if push is None else films.ring
+        for place, answer in enumerate(answers):
+            answer.scale = float(trail.scale[place] * unit[place])
+            answer.steps = int(trail.taken[place]), int(trail.rejected[place])
+            answer.lost = trail.lost.get(place)
+        _Reader(films, courses, trail, times, answers, how).read()
+        return answers, [k for k, folded in zip(mine, trail.folded.tolist(), strict=True) if folded]
+
+    def solve_folded(self, mine: Sequence[int], modes: int, pieces: int) -> list[_Answer]:
+        """Answers of folded films, with many elements as their edges are anywhere in them: those of the finer ones.
+
+        They err by less than they differ from those of fewer elements.
+        """
+        (coarse, _), (fine, _) = (self.solve(mine, modes, pieces * many) for many in FOLDED_PIECES)
+        for rough, answer, k in zip(coarse, fine, mine, strict=True):
+            unit = self.specimens[k].ring_radius if self.how.push is not None else _unit(self.specimens[k])
+            off = np.abs(rough.rows[0] - answer.rows[0]) * unit / answer.scale
+            largest = float(np.nanmax(off, initial=0.0))
+            answer.error += np.where(np.isfinite(off), np.maximum(off, 0.3 * largest), largest)
+        return fine
 
 
 AT_ONCE_PARTS = (1, 8)  # of the way from the flat film to a state, all at once or in so many
@@ -165,7 +227,7 @@ def at_once(specimen: Specimen, h: ArrayLike, voltage: ArrayLike = 0.0, *, toler
     have there after any way from rest that only pushes. NaN where it has no state.
     """
     h, voltage = np.broadcast_arrays(np.asarray(h, dtype=float), np.asarray(voltage, dtype=float))
-    [(modes, _)] = _alike([_bare(specimen)], tolerance)
+    [(modes, _, _)] = _alike([_bare(specimen)], tolerance)
     force = np.full(h.size, np.nan)
     with np.errstate(all="ignore"):
         for parts in AT_ONCE_PARTS:
@@ -178,7 +240,7 @@ def at_once(specimen: Specimen, h: ArrayLike, voltage: ArrayLike = 0.0, *, toler
             for part in range(1, parts + 1):
                 instant = Instant(part * height, part * volts)
                 state = flat_guess(films, instant) if state is None else state
-                at = balance(films, instant, rest, np.zeros_like(films.time), state, goal(tolerance, False))
+                at = balance(films, instant, rest, np.zeros_like(films.time), state, How(tolerance).goal)
                 state = at.state
             force[left] = np.where(at.ok, instant.side * films.unit * at.lam, np.nan)
     return np.where(h == 0.0, 0.0 * force.reshape(h.shape), force.reshape(h.shape))
@@ -190,7 +252,7 @@ def _checked(
     t = np.atleast_1d(np.asarray(t, dtype=float))
     if t.ndim != 1 or len(t) < 2:
         raise ValueError("t: a history needs at least two times")
-    if not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
+    if not (np.isfinite(t).all() and (np.diff(t) >= 0.0).all()):
         raise ValueError("t: the times of a history must be finite and rise")
     values = []
     for name, given in (("h", h), ("voltage", voltage)):
@@ -200,12 +262,16 @@ def _checked(
         if not np.isfinite(value).all():
             raise ValueError(f"{name} holds a value that is not finite")
         values.append(np.broadcast_to(value, t.shape).copy())
+    again = np.flatnonzero(np.diff(t) == 0.0)
+    if any((value[again] != value[again + 1]).any() for value in values) or len(again) == len(t) - 1:
+        raise ValueError(f"t: the times of a history must rise; a jump at {t[again[0]]:g} s needs a time of its own")
     asked = t if times is None else np.atleast_1d(np.asarray(times, dtype=float))
     if not (np.isfinite(asked).all() and (asked >= t[0]).all() and (asked <= t[-1]).all()):
         raise ValueError(f"times must be finite and within the history, {t[0]:g} to {t[-1]:g} s")
     if not 1e-10 <= tolerance <= 1e-2:
         raise ValueError(f"tolerance = {tolerance!r}: allowed are 1e-10 to 1e-2")
-    return Course(t, *values), asked
+    rising = np.concatenate((np.diff(t) > 0.0, [True]))  # a hold of no length is none
+    return Course(t[rising], *(value[rising] for value in values)), asked
 
 
 def _bare(specimen: Specimen) -> Specimen:
@@ -226,8 +292,14 @@ def _elastic(specimens: Sequence[Specimen], courses: Sequence[Course]) -> Array:
     return np.array([float(np.nanmax(one, initial=0.0)) for one in np.split(force, ends)])
 
 
-def _alike(specimens: Sequence[Specimen], tolerance: float) -> list[tuple[int, list[int]]]:
-    """Films that can be solved together: the modes that they take, and their numbers."""
+def _unit(specimen: Specimen) -> float:
+    """N of the dimensionless force."""
+    shear = specimen.material.shear_modulus
+    return 2.0 * np.pi * specimen.ring_radius * specimen.thickness * shear / specimen.prestretch**2
+
+
+def _alike(specimens: Sequence[Specimen], tolerance: float) -> list[tuple[int, int, list[int]]]:
+    """Films that can be solved together: the modes and elements that they take, and their numbers."""
     found: dict[tuple[object, ...], list[int]] = {}
     for k, one in enumerate(specimens):
         material = one.material
@@ -236,15 +308,16 @@ def _alike(specimens: Sequence[Specimen], tolerance: float) -> list[tuple[int, l
         modes = refinement.first_modes(span / pieces, tolerance) + MORE_MODES
         kind = (material.law, len(material.mu), len(material.alpha), len(material.branches), pieces, modes)
         found.setdefault(kind, []).append(k)
-    return [(kind[-1], mine) for kind, mine in found.items()]  # type: ignore[misc]
+    return [(kind[-1], kind[-2], mine) for kind, mine in found.items()]  # type: ignore[misc]
 
 
 @dataclass(slots=True)
 class _Answer:
     """The answers of one history while they are being filled.
 
-    rows : dimensionless force, largest field over that of the flat film's unit, least hoop and meridional stress, and
-        the derivatives of the force, (4 + P, times)
+    rows : dimensionless force, or height of a free disk, largest field over that of the flat film's unit, least hoop
+        and meridional stress, whether it is folded, and the derivatives of the first, (ROWS + P, times)
+    lost : the time after which there is no state, and why
     """
 
     rows: Array
@@ -252,65 +325,89 @@ class _Answer:
     status: NDArray[np.int8]
     scale: float = 1.0
     steps: tuple[int, int] = (0, 0)
+    lost: tuple[float, Status] | None = None
 
     @classmethod
     def empty(cls, count: int, columns: int) -> _Answer:
         status = np.full(count, Status.NOT_CONVERGED, dtype=np.int8)
-        return cls(np.full((4 + columns, count), np.nan), np.full(count, np.nan), status)
+        return cls(np.full((ROWS + columns, count), np.nan), np.full(count, np.nan), status)
 
     def fill(self, asked: NDArray[np.intp], rows: Array, error: Array | float) -> None:
         """Take over solved answers."""
         self.rows[:, asked] = rows
         self.error[asked] = error
-        wrinkled = rows[HOOP] < ROUND_OFF_TENSION * rows[MERIDIONAL]
+        wrinkled = (rows[HOOP] < ROUND_OFF_TENSION * rows[MERIDIONAL]) | (rows[FOLDED] > 0.5)
         status = np.where(wrinkled, Status.WRINKLED, Status.TAUT)
         self.status[asked] = np.where(np.isfinite(rows[0]), status, Status.NOT_CONVERGED)
 
-    def history(
-        self, specimen: Specimen, course: Course, times: Array, lost: tuple[float, Status] | None, tolerance: float
-    ) -> History:
-        """Everything with its units, the error over the largest force of the history."""
-        if lost is not None:
-            self.status[times > lost[0]] = lost[1]
-        film, material = specimen, specimen.material
+    def history(self, specimen: Specimen, course: Course, times: Array, how: How) -> History:
+        """Everything with its units, the error over the largest answer of the history."""
+        if self.lost is not None:
+            self.status[times > self.lost[0]] = self.lost[1]
         answered = self.status <= Status.WRINKLED
-        shear = material.shear_modulus
-        unit = 2.0 * np.pi * film.ring_radius * film.thickness * shear / film.prestretch**2
+        shear, unit = specimen.material.shear_modulus, _unit(specimen)
         h, volts = np.interp(times, course.t, course.h), np.interp(times, course.t, course.voltage)
         rows = np.where(answered, self.rows, np.nan)
-        side = np.where(h < 0.0, -1.0, 1.0)
-        force = np.where(answered & (h == 0.0), 0.0, side * unit * rows[0])
-        largest = max(float(np.nanmax(np.abs(force), initial=0.0)), self.scale)
-        slopes = None
-        if len(rows) > 4:
-            slopes = _with_units(specimen, force, unit, side * unit * rows[4:], side)
+        dforce = dh = None
+        if how.push is None:
+            side = np.where(h < 0.0, -1.0, 1.0)
+            force = np.where(answered & (h == 0.0), 0.0, side * unit * rows[0])
+            if how.sensitivities:
+                dforce = _with_units(specimen, force, side * unit * rows[ROWS:])
+        else:
+            number, share = np.zeros(len(times), dtype=np.intp), h
+            h = np.where(answered & (share == 0.0), 0.0, specimen.ring_radius * rows[0])
+            force = share * how.push(number, h)[0]
+            if how.sensitivities:
+                dh = _with_units_free(specimen, specimen.ring_radius * rows[ROWS:])
+        largest = max(float(np.nanmax(np.abs(force if how.push is None else h), initial=0.0)), self.scale)
         return History(
             force=force,
-            peak_field=np.abs(volts) / film.thickness * np.exp(rows[PEAK]),
+            h=h,
+            peak_field=np.abs(volts) / specimen.thickness * np.exp(rows[PEAK]),
             min_hoop_stress=shear * rows[HOOP],
             min_meridional_stress=shear * rows[MERIDIONAL],
             status=self.status,
-            error_estimate=np.where(answered, self.error * self.scale / largest + LEAST_SHARE * tolerance, np.nan),
+            error_estimate=np.where(answered, self.error * self.scale / largest + LEAST_SHARE * how.tolerance, np.nan),
             steps=self.steps[0],
             rejected=self.steps[1],
-            dforce=slopes,
+            dforce=dforce,
+            dh=dh,
         )
 
 
-def _with_units(specimen: Specimen, force: Array, unit: float, rows: Array, side: Array) -> dict[str, Array]:
-    """Derivatives (N over the parameter's unit) from those of the columns in `Films.columns`, in N."""
+def _columns(specimen: Specimen, rows: Array) -> tuple[dict[str, Array], Array, Array, Array]:
+    """Rows of `Films.columns` by the parameter's name and over its unit; those of ln(field), ln(lp) and the last."""
     material, n, k = specimen.material, len(specimen.material.mu), len(specimen.material.branches)
     shapes = len(material.alpha)
-    mu, alpha, field, ratio, time, prestretch, height = np.split(rows, np.cumsum([n, shapes, 1, k, k, 1]))
-    return {
+    mu, alpha, field, ratio, time, prestretch, last = np.split(rows, np.cumsum([n, shapes, 1, k, k, 1]))
+    named = {
         "mu": mu.T / material.shear_modulus,
         "alpha": alpha.T,
         "eps_r": field[0] / material.eps_r,
         "ratio": ratio.T,
         "time": time.T / np.array([one.time for one in material.branches]),
-        "thickness": (force - 2.0 * field[0]) / specimen.thickness,
-        "prestretch": (prestretch[0] - 2.0 * force) / specimen.prestretch,
-        "h": height[0],
+    }
+    return named, field[0], prestretch[0], last[0]
+
+
+def _with_units(specimen: Specimen, force: Array, rows: Array) -> dict[str, Array]:
+    """Derivatives of the force (N over the parameter's unit) from those of the columns in `Films.columns`, in N."""
+    named, field, prestretch, height = _columns(specimen, rows)
+    return named | {
+        "thickness": (force - 2.0 * field) / specimen.thickness,
+        "prestretch": (prestretch - 2.0 * force) / specimen.prestretch,
+        "h": height,
+    }
+
+
+def _with_units_free(specimen: Specimen, rows: Array) -> dict[str, Array]:
+    """The same of a free disk's displacement (m): a film of more force moves like one under less load."""
+    named, field, prestretch, load = _columns(specimen, rows)
+    return named | {
+        "thickness": (-load - 2.0 * field) / specimen.thickness,
+        "prestretch": (prestretch + 2.0 * load) / specimen.prestretch,
+        "load": load,
     }
 
 
@@ -336,11 +433,10 @@ class _Reader:
         trail: Trail,
         times: Sequence[Array],
         answers: Sequence[_Answer],
-        goal: float,
-        allowed: Array,
+        how: How,
     ) -> None:
         self.films, self.courses, self.trail, self.times = films, courses, trail, times
-        self.answers, self.goal, self.allowed = answers, goal, allowed
+        self.answers, self.how = answers, how
 
     def read(self) -> None:
         """Fill every answer."""
@@ -356,15 +452,11 @@ class _Reader:
                     again.append(replace(job, x=job.x_asked))
                 else:
                     found, missed = _between(rows, job.x_asked)
-                    if missed > self.allowed[job.film] and nodes < MOST_NODES:
+                    if missed > self.how.tolerance * self.trail.scale[job.film] and nodes < MOST_NODES:
                         again.append(replace(job, x=_lobatto(2 * nodes - 1)))
                     else:
-                        answer.fill(job.asked, found, error + missed / self.scale(job.film))
+                        answer.fill(job.asked, found, error + missed / self.trail.scale[job.film])
             jobs, nodes = again, 2 * nodes - 1
-
-    def scale(self, film: int) -> float:
-        """Largest dimensionless force of a film."""
-        return float(self.answers[film].scale / self.films.unit[film])
 
     def _jobs(self) -> list[_Job]:
         """Every step that has answers in it."""
@@ -394,7 +486,7 @@ class _Reader:
         return jobs
 
     def _solved(self, jobs: Sequence[_Job]) -> Iterator[tuple[_Job, Array, NDArray[np.bool_]]]:
-        """Rows of an answer (4 + P, nodes) of every job, and where there is one."""
+        """Rows of an answer (ROWS + P, nodes) of every job, and where there is one."""
         some: list[_Job] = []
         size = 0
         for k, job in enumerate(jobs):
@@ -424,27 +516,33 @@ class _Reader:
             course = self.courses[job.film]
             h[owner == k] = np.interp(t[owner == k], course.t, course.h)
             voltage[owner == k] = np.interp(t[owner == k], course.t, course.voltage)
-        instant = Instant(h, voltage)
+        instant = self.how.instant(np.repeat([job.film for job in jobs], count), h, voltage)
         viscous = _hermite(x, dt, *(gather(name, end) for end in ("before", "after") for name in ("viscous", "rate")))
         p0, p1 = gather("packed", "before"), gather("packed", "after")
         middle = np.repeat(np.stack([job.step.middle[..., job.column] for job in jobs], axis=-1), count, axis=-1)
         packed = p0 + x * (p1 - p0 + 2.0 * (1.0 - x) * (2.0 * middle - p0 - p1))
-        state = unpack(films, instant.height(films), packed)
-        state.w = np.where(state.w > 0.0, state.w, unpack(films, instant.height(films), p1).w)
-        at = balance(films, instant, viscous, np.zeros_like(films.time), state, self.goal)
-        fine = fine_table(films.grid.table.modes)
-
-        def largest(values: Array) -> Array:
-            most: Array = np.tensordot(fine, values, 1).max(axis=(0, 1))
-            return most
-
-        law = at.points.law
-        rows = [at.lam, largest(-at.points.log[2]), -largest(-law.t2), -largest(-law.t1)]
+        state = unpack(films, instant, packed)
+        state.w = np.where(state.w > 0.0, state.w, unpack(films, instant, p1).w)
+        at = balance(films, instant, viscous, np.zeros_like(films.time), state, self.how.goal)
+        rows = _outputs(at, films)
         if jobs[0].step.before.viscous_slopes is not None:
             names = ("viscous_slopes", "rate_slopes")
             start = _hermite(x, dt, *(gather(name, end) for end in ("before", "after") for name in names))
-            rows += list(slopes(at, instant, start).lam)
+            rows += list(slopes(at, instant, start).answer)
         return np.array(rows), at.ok
+
+
+def _outputs(at: Balance, films: Films) -> list[Array]:
+    """The first rows of an answer; between the points where nothing is folded, as then they are smooth."""
+    folded = at.folded
+    fine = fine_table(films.grid.table.modes)
+
+    def largest(values: Array) -> Array:
+        most: Array = np.tensordot(fine, values, 1).max(axis=(0, 1))
+        return np.where(folded, values.max(axis=(0, 1)), most)
+
+    law = at.points.law
+    return [at.answer, largest(-at.points.log[2]), -largest(-law.t2), -largest(-law.t1), folded.astype(float)]
 
 
 def _hermite(x: Array, dt: Array, first: Array, first_rate: Array, last: Array, last_rate: Array) -> Array:

@@ -8,151 +8,34 @@ and the membrane for equilibrium under ``S(u) + sum_k beta_k S(x^k) - eps E^2``.
 each point the ``x`` are eliminated, which leaves the tangent ``C (I + c P C/2)^-1`` of a branch, a symmetric matrix, so
 that unknowns, reduced matrix and test of stability are those of the elastic film (`model.membrane.ritz`).
 
+A disk that is free to move has one unknown more, its height, and one equation: the film's force is that of its load. It
+is stable where the film's force grows faster with the height than the load does.
+
+Where the relaxed energy is asked for, each point with a negative hoop stress takes its natural width in place of the
+film's, by itself (as `model.membrane.tension_field.search` does): viscous strains stay at their points, and so do they.
+
 Arrays at points have the shape (Q, M, S), those of branches (K, Q, M, S): points of an element, elements, films.
 Columns of derivatives stand before the films, (..., P, S).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Array
-from model.material.law import Evaluations, Film, Law, Stress
+from model.material.law import Evaluations, Film, Stress, relax
 from model.membrane import refinement, ritz
-from model.membrane.ritz import Grid, Index, Problem
-from model.specimen import Specimen
+from model.membrane.ritz import Problem
+from model.membrane.viscous_films import FLAT, Films, Instant, Load, State
 
-FLAT = 1e-9  # height over ring radius that stands for the flat film
 MOST_STEPS = 25
 LONGEST_STRAIN_STEP = 0.5  # of an elastic strain of a branch, in one step of Newton's method
-
-
-@dataclass(slots=True)
-class Films:
-    """Films of one law, of the same numbers of parameters and branches, along the last axis.
-
-    law : of the relaxed films, moduli over G, (n, S) or (n, 1) where all share it
-    ratio, time : of the branches, (K, 1, 1, S)
-    log_prestretch, span, ring : ``ln lp``, ``ln(b/a)``, b (m), (S,)
-    field : ``eps / (T^2 G)``, which times V^2 is the Maxwell stress, (S,)
-    unit : N of the dimensionless force, (S,)
-    shear_slopes : derivatives of G/G by moduli (over G) and shape parameters, (n, S)
-    grid : the elements
-    """
-
-    law: Law
-    ratio: Array
-    time: Array
-    log_prestretch: Array
-    span: Array
-    ring: Array
-    field: Array
-    unit: Array
-    shear_slopes: Array
-    grid: Grid
-
-    @classmethod
-    def of(cls, specimens: Sequence[Specimen], modes: int) -> Films:
-        """Films of like specimens."""
-        materials = [one.material for one in specimens]
-        shear = np.array([one.shear_modulus for one in materials])
-        law = materials[0].law
-        mu, alpha = np.array([one.mu for one in materials]).T / shear, np.array([one.alpha for one in materials]).T
-        slopes = np.array([_shear_slopes(law, m, a) for m, a in zip(mu.T, alpha.T, strict=True)]).T
-        if (mu == mu[:, :1]).all() and (alpha == alpha[:, :1]).all():
-            mu, alpha = mu[:, :1], alpha[:, :1]
-        branches = [one.branches for one in materials]
-        thickness = np.array([one.thickness for one in specimens])
-        prestretch = np.array([one.prestretch for one in specimens])
-        ring = np.array([one.ring_radius for one in specimens])
-        span = np.log(ring / np.array([one.disk_radius for one in specimens]))
-        pieces = ritz.elements(span)
-        return cls(
-            law(mu, alpha.reshape(-1, mu.shape[1])),
-            np.array([[b.ratio for b in each] for each in branches], dtype=float).T.reshape(-1, 1, 1, len(specimens)),
-            np.array([[b.time for b in each] for each in branches], dtype=float).T.reshape(-1, 1, 1, len(specimens)),
-            np.log(prestretch),
-            span,
-            ring,
-            np.array([one.permittivity for one in materials]) / (thickness**2 * shear),
-            2.0 * math.pi * ring * thickness * shear / prestretch**2,
-            slopes,
-            Grid.lay(modes, -span * np.linspace(1.0, 0.0, pieces + 1)[:, None]),
-        )
-
-    def take(self, index: Index) -> Films:
-        """The films at ``index``."""
-        return Films(
-            self.law.take(index),
-            self.ratio[..., index],
-            self.time[..., index],
-            self.log_prestretch[index],
-            self.span[index],
-            self.ring[index],
-            self.field[index],
-            self.unit[index],
-            self.shear_slopes[:, index],
-            self.grid.take(index),
-        )
-
-    @property
-    def branches(self) -> int:
-        return len(self.ratio)
-
-    @property
-    def columns(self) -> int:
-        """Derivatives a film has: moduli, shape parameters, ln(field), ratios, ln(times), ln(pre-stretch), height."""
-        return len(self.shear_slopes) + 2 * self.branches + 3
-
-
-def _shear_slopes(law: type[Law], mu: Array, alpha: Array) -> list[float]:
-    """Derivatives of the shear modulus by moduli and shape parameters, by differences of the fourth order.
-
-    It is linear in the moduli, and of a low degree in the shape parameters.
-    """
-    slopes = []
-    for which in range(len(mu) + len(alpha)):
-        value = np.concatenate((mu, alpha))
-        step, total = 1e-3 * max(1.0, abs(float(value[which]))), 0.0
-        for shift, weight in ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0)):
-            moved = value.copy()
-            moved[which] += shift * step
-            total += weight * law.shear_modulus(moved[: len(mu)].tolist(), moved[len(mu) :].tolist())
-        slopes.append(total / (12.0 * step))
-    return slopes
-
-
-@dataclass(slots=True)
-class State:
-    """Modes and cuts (n, S), slopes (Q, M, S), elastic strains of the branches (2, K, Q, M, S)."""
-
-    c: Array
-    w: Array
-    x: Array
-
-
-@dataclass(slots=True)
-class Instant:
-    """What drives the films at one instant, (S,) each: displacement (m), voltage (V)."""
-
-    h: Array
-    voltage: Array
-
-    def height(self, films: Films) -> Array:
-        """Height over ring radius, that of the flat film not quite zero."""
-        found: Array = np.maximum(np.abs(self.h) / films.ring, FLAT)
-        return found
-
-    @property
-    def side(self) -> Array:
-        """1 where the disk is pushed to positive h, -1 on the other side."""
-        found: Array = np.where(self.h < 0.0, -1.0, 1.0)
-        return found
+LONGEST_RISE, LONGEST_FALL = 0.1, 0.5  # of a free disk: over the ring radius, or its height where that is more; of it
+LEAST_SLACK = 1e-15  # of a point that has begun to fold
+MOST_FLIPS = 12  # steps of Newton's method in which points may fold or get taut again
 
 
 @dataclass(slots=True)
@@ -174,13 +57,36 @@ class _Branches:
 
 
 @dataclass(slots=True)
+class _Folds:
+    """How natural widths follow where the film is folded: ``dL2 = -give t2 + rate dL1``; zero elsewhere, (Q, M, S)."""
+
+    where: NDArray[np.bool_]
+    give: Array
+    rate: Array
+
+
+@dataclass(slots=True)
+class _Free:
+    """Free disks: what the modes do when the height grows (n, S), stiffness of the film, and its excess (S,)."""
+
+    modes: Array
+    stiffness: Array
+    excess: Array  # stiffness of the film less that of the load
+    push: Array  # the load
+
+
+@dataclass(slots=True)
 class Balance:
     """Films in equilibrium, with what their derivatives need.
 
     state, lam : state, and the dimensionless force (S,)
+    answer : the force, of a free disk its height over the ring radius
     u : logarithmic stretches (2, Q, M, S)
     ok : (S,): found, in tension, and stable
-    tail : error of the force by the number of modes, over the force
+    tail : error of the answer by the number of modes
+    raw : stresses and tangents before folds take the hoop stress away
+    folds : where the film is folded, how the natural width follows; None where no point is
+    free : of free disks, what follows when they move
     """
 
     films: Films
@@ -194,6 +100,19 @@ class Balance:
     system: ritz.Reduced
     inverse: Array
     branches: _Branches
+    raw: Stress
+    folds: _Folds | None
+    free: _Free | None
+
+    @property
+    def folded(self) -> NDArray[np.bool_]:
+        """Which films are folded somewhere."""
+        found = np.zeros(len(self.lam), dtype=np.bool_)
+        return found if self.folds is None else found | self.folds.where.any(axis=(0, 1))
+
+    @property
+    def answer(self) -> Array:
+        return self.lam if self.free is None or self.state.height is None else self.state.height
 
     def respond(
         self, on_stress: Array | float, gap: Array, height: Array | float = 0.0
@@ -208,7 +127,8 @@ class Balance:
 
         Returns
         -------
-        Changes of ``lam`` (P, S), of the logarithmic stretches by motion, and of the branches' elastic strains.
+        Changes of the answer (P, S), of the logarithmic stretches by motion, and of the branches' elastic strains. A
+        change of the height is, of a free disk, one of its load.
         """
         system, at, films = self.system, self.points, self.films
         b11, b12, b22 = (one[..., None, :] for one in self.branches.b)
@@ -225,20 +145,31 @@ class Balance:
             one[..., None, :] for one in (system.hw, system.kqw, system.kew, at.along, at.around, at.down)
         )
         flat = (*shape[:2], count * size)
+        if self.folds is not None:
+            fold_give, fold_rate = self.folds.give[..., None, :], self.folds.rate[..., None, :]
+            t1, natural = t1 + fold_rate * t2, -fold_give * t2
+            t2 = t2 * ~self.folds.where[..., None, :]
         pull = t1 * down
         give = hw * pull
         twice, once = films.grid.twice[..., None, :], films.grid.once[..., None, :]
         residual = grid.project(
             (twice * (t2 * around - give * kew)).reshape(flat), (twice * (t1 * along - give * kqw)).reshape(flat)
         ).reshape(-1, count, size)
-        lam0 = (height + (once * give).sum(axis=(0, 1))) / system.give
+        free = self.free
+        lam0 = ((height if free is None else 0.0) + (once * give).sum(axis=(0, 1))) / system.give
         coupling = system.coupling[:, None]
         dc = -np.einsum("sij,jps->ips", self.inverse, residual + lam0 * coupling)
-        lam = lam0 + (coupling * dc).sum(axis=0) / system.give
+        answer = lam = lam0 + (coupling * dc).sum(axis=0) / system.give
+        if free is not None:
+            answer = (height - lam) / free.excess
+            dc += free.modes[:, None] * answer
+            lam = lam + free.stiffness * answer
         de, dq = (one.reshape(shape) for one in grid.strain(dc.reshape(-1, count * size)))
         dw = hw * (lam / films.grid.radius[..., None, :] - pull - kqw * dq - kew * de)
         du1, du2 = along * dq + down * dw, around * de
-        return lam, (du1, du2), self.branches.follow(gap[0] + du1, gap[1] + du2)
+        if self.folds is not None:
+            du2 = np.where(self.folds.where[..., None, :], natural + fold_rate * du1, du2)
+        return answer, (du1, du2), self.branches.follow(gap[0] + du1, gap[1] + du2)
 
 
 def balance(
@@ -246,14 +177,19 @@ def balance(
 ) -> Balance:
     """Equilibrium of films whose viscous strains follow ``start`` (2, K, Q, M, S) with ``lag`` (K, 1, 1, S).
 
-    Newton's method from ``state``, until slopes (relative) and strains change by less than ``goal``.
+    Newton's method from ``state``, until slopes (relative) and strains change by less than ``goal``. Of a film that
+    its load leaves flat the height is nearly zero.
     """
-    grid, height = films.grid, instant.height(films)
+    grid, load = films.grid, instant.load
     field = films.field * instant.voltage**2 if instant.voltage.any() else None
-    c, w, x = state.c, state.w, state.x
+    c, w, x, slack = state.c, state.w, state.x, state.slack if instant.relaxed else None
+    height = instant.height(films) if load is None or state.height is None else state.height
+    if instant.relaxed and slack is None:
+        slack = np.zeros_like(w)
     count = Evaluations()
-    for _ in range(limit):
-        logs, points, branches, (r1, r2) = _evaluate(films, field, start, lag, State(c, w, x), count)
+    for iteration in range(limit):
+        at = _evaluate(films, field, start, lag, State(c, w, x, None, slack), count)
+        points, folds, branches, (r1, r2) = at.points, at.folds, at.branches, at.residual
         system = ritz.reduce(grid, w, points)
         matrix = np.moveaxis(system.condensed(), 2, 0)
         try:
@@ -263,31 +199,70 @@ def balance(
         lam0 = (height - system.reach) / system.give
         dc = -np.einsum("sij,js->is", inverse, system.residual + lam0 * system.coupling)
         lam = lam0 + (system.coupling * dc).sum(axis=0) / system.give
+        free, rise = None, np.zeros_like(lam)
+        if load is not None:
+            free = _freed(films, load, system, inverse, height)
+            rise = (free.push - lam) / np.where(free.excess > 0.0, free.excess, 1e-9)
+            rise = np.clip(rise, -LONGEST_FALL * height, np.maximum(LONGEST_RISE, height))
+            rise = np.where(load.share == 0.0, FLAT - height, rise)
+            dc += free.modes * rise
+            lam = lam + free.stiffness * rise
         de, dq = grid.strain(dc)
         dw = system.hw * (lam / grid.radius - system.gw - system.kqw * dq - system.kew * de)
         du1, du2 = points.along * dq + points.down * dw, points.around * de
+        if folds is not None:
+            du2 = np.where(folds.where, -folds.give * at.raw.t2 + folds.rate * du1, du2)
         dx = np.array(branches.follow(r1 + du1, r2 + du2))
         change = np.abs(dw / w).max(axis=(0, 1))
         if points.law.maxwell is not None:
             change *= np.sqrt(np.abs(points.law.maxwell / points.law.t1).max(axis=(0, 1), initial=1.0))
         change = np.maximum(change, np.abs(dx).max(axis=(0, 1, 2, 3), initial=0.0))
-        if change.max() <= goal:
+        short = np.where(change > 2.0, 2.0 / change, 1.0)
+        if slack is not None:
+            before, slack = slack, _slackened(films, at, short * du2, short * de, iteration < MOST_FLIPS)
+            change = np.maximum(change, np.where(((before > 0.0) != (slack > 0.0)).any(axis=(0, 1)), 2.0 * goal, 0.0))
+        largest = change.max()
+        height = height + short * rise
+        if largest <= goal:
             c, w, x = c + dc, w + dw, x + dx
             break
-        short = np.where(change > 2.0, 2.0 / change, 1.0)
         moved = w + short * dw
         c, w = c + short * dc, np.where(moved > 0.2 * w, moved, 0.2 * w)
         x = x + np.clip(short * dx, -LONGEST_STRAIN_STEP, LONGEST_STRAIN_STEP)
         if not (change > goal).any():
             break
-    u = np.array((logs[0, 0] + du1, logs[1, 0] + du2))
+    u = np.array((at.logs[0, 0] + du1, at.logs[1, 0] + du2))
     with np.errstate(invalid="ignore"):
         ok = (change <= goal) & (lam > 0.0) & system.positive & _definite(matrix)
+        if folds is not None:
+            ok &= (~folds.where | (at.raw.h22 > 0.0)).all(axis=(0, 1))
+        if free is not None:
+            ok &= (free.excess > 0.0) | (free.push == 0.0)
     diagonal = np.einsum("sii->is", matrix)
-    problem = Problem(Film(films.law, field, count), films.log_prestretch, films.span, height)
+    problem = Problem(Film(points.law, field, count), films.log_prestretch, films.span, height)  # type: ignore[arg-type]
     step = ritz.Step(dc, dw, lam, ok, diagonal)
-    tail = np.where(height > FLAT, np.abs(refinement.tail(problem, grid, ritz.State(c, w), step)), 0.0)
-    return Balance(films, State(c, w, x), lam, u, ok, tail, logs, points, system, inverse, branches)
+    state = State(c, w, x, height, slack)
+    tail = lam * np.where(height > 2.0 * FLAT, np.abs(refinement.tail(problem, grid, ritz.State(c, w), step)), 0.0)
+    if free is not None:
+        tail = tail / np.abs(free.excess)
+    return Balance(films, state, lam, u, ok, tail, at.logs, points, system, inverse, branches, at.raw, folds, free)
+
+
+def _freed(films: Films, load: Load, system: ritz.Reduced, inverse: Array, height: Array) -> _Free:
+    """Free disks at an iterate."""
+    modes = -np.einsum("sij,js->is", inverse, system.coupling / system.give)
+    stiffness = (1.0 + (system.coupling * modes).sum(axis=0)) / system.give
+    push, slope = load.at(films, height)
+    return _Free(modes, stiffness, stiffness - slope, push)
+
+
+def _slackened(films: Films, at: _Iterate, du2: Array, de: Array, flips: bool) -> Array:
+    """How far natural widths are above the film's own after a step; with ``flips`` points may fold or get taut."""
+    fold = np.where(at.raw.t2 < 0.0, LEAST_SLACK, 0.0) if flips else np.zeros_like(de)
+    if at.folds is None:
+        return fold
+    kept = at.logs[1, 0] + du2 - np.log1p(np.maximum(at.points.e + de, -0.9)) - films.log_prestretch
+    return np.where(at.folds.where, np.maximum(kept, 0.0 if flips else LEAST_SLACK), fold)
 
 
 def _definite(matrix: Array) -> NDArray[np.bool_]:
@@ -304,16 +279,31 @@ def _definite(matrix: Array) -> NDArray[np.bool_]:
     return np.ones(len(matrix), dtype=np.bool_)
 
 
+@dataclass(slots=True)
+class _Iterate:
+    """An iterate at the points; ``residual``: what the strains of the branches miss, (K, Q, M, S) each."""
+
+    logs: Array
+    points: ritz.Points
+    raw: Stress
+    folds: _Folds | None
+    branches: _Branches
+    residual: tuple[Array, Array]
+
+
 def _evaluate(
     films: Films, field: Array | None, start: Array, lag: Array, state: State, count: Evaluations
-) -> tuple[Array, ritz.Points, _Branches, tuple[Array, Array]]:
+) -> _Iterate:
     """Strains, stresses and tangents with the branches' strains eliminated, and what these miss."""
     e, q = films.grid.strain(state.c)
     metric = (q + 2.0) * q
     metric += state.w * state.w
     logs = np.empty((3, 1 + films.branches, *e.shape))
     logs[0, 0] = 0.5 * np.log1p(metric) + films.log_prestretch
-    logs[1, 0] = np.log1p(e) + films.log_prestretch
+    hoop = np.log1p(e) + films.log_prestretch
+    logs[1, 0] = hoop
+    if state.slack is not None:
+        logs[1, 0] += state.slack
     logs[:2, 1:] = state.x
     np.add(logs[0], logs[1], out=logs[2])
     np.negative(logs[2], out=logs[2])
@@ -348,7 +338,13 @@ def _evaluate(
         maxwell = field * np.exp(-2.0 * logs[2, 0])
         sums[:2] -= maxwell
         sums[2:] -= 2.0 * maxwell
-    law = Stress(sums[0], sums[1], sums[2], sums[3], sums[4], maxwell)
+    raw = law = Stress(sums[0], sums[1], sums[2], sums[3], sums[4], maxwell)
+    folds = None
+    if state.slack is not None and state.slack.any():
+        folded = state.slack > 0.0
+        law = relax(Film(films.law, field, count), raw, folded)
+        assert law.relief is not None
+        folds = _Folds(folded, folded / raw.h22, law.relief.rate)
     points = ritz.Points(
         e=e,
         q=q,
@@ -358,9 +354,10 @@ def _evaluate(
         down=state.w / metric,
         around=1.0 / (e + 1.0),
         metric=metric,
-        hoop=logs[1, 0],
+        hoop=hoop,
     )
-    return logs, points, _Branches((p1, p2), half, (a11, a12, a21, a22), (b11, b12, b22)), (r1, r2)
+    branches = _Branches((p1, p2), half, (a11, a12, a21, a22), (b11, b12, b22))
+    return _Iterate(logs, points, raw, folds, branches, (r1, r2))
 
 
 def flow(films: Films, x: Array) -> Array:
@@ -371,9 +368,9 @@ def flow(films: Films, x: Array) -> Array:
 
 @dataclass(slots=True)
 class Slopes:
-    """Derivatives by every column (`Films.columns`): of ``lam`` (P, S), of x and v (2, K, Q, M, P, S)."""
+    """Derivatives by every column (`Films.columns`): of the answer (P, S), of x and v (2, K, Q, M, P, S)."""
 
-    lam: Array
+    answer: Array
     x: Array
     viscous: Array
 
@@ -391,7 +388,7 @@ def slopes(at: Balance, instant: Instant, start: Array) -> Slopes:
     on_branch = np.zeros((2, kinds, *points, count, size))
     on_stress[..., :n, :] = laws[:, 0]
     on_branch[..., :n, :] = laws[:, 1:]
-    law = at.points.law
+    law = at.raw
     if law.maxwell is not None:
         on_stress[..., field, :] = -law.maxwell
     lag = np.zeros((kinds, count, size))  # relative change of ``c``
@@ -415,11 +412,11 @@ def slopes(at: Balance, instant: Instant, start: Array) -> Slopes:
         gap[0] -= third * (2.0 * on_branch[0] - on_branch[1])
         gap[1] -= third * (2.0 * on_branch[1] - on_branch[0])
     height = np.zeros((count, size))
-    height[-1] = instant.side / films.ring
-    lam, (du1, du2), x = at.respond(on_stress, gap, height)
+    height[-1] = instant.side / films.ring if at.free is None else at.free.push
+    answer, (du1, du2), x = at.respond(on_stress, gap, height)
     viscous = np.array((du1 - x[0], du2 - x[1]))
     viscous[..., pre, :] += 1.0
-    return Slopes(lam, np.array(x), viscous)
+    return Slopes(answer, np.array(x), viscous)
 
 
 def flow_slopes(films: Films, at: Balance, x: Array, rate: Array) -> Array:

@@ -8,6 +8,9 @@ from typing import Any, cast
 
 import numpy as np
 
+from model.actuator.bias import Antagonist, Bias, Bistable, Mass, Spring, Tabulated
+from model.actuator.creep import creep
+from model.actuator.equilibrium import Actuator
 from model.material.laws import find_law
 from model.material.materials import Branch, Material
 from model.material.ogden import Ogden
@@ -19,6 +22,14 @@ NUMBERS = ("a", "b", "thickness", "prestretch", "h")
 OPTIONAL = {"voltage": 0.0, "tolerance": 1e-8}
 KEYS = ("id", *NUMBERS, *OPTIONAL, "wrinkling", "material")
 ALONG = ("id", "a", "b", "thickness", "prestretch", "material", "history", "times")  # of a case along a history
+DRIVES = ("h", "weight")  # of a history: displacement, or a weight that hangs on the disk; neither beside a bias
+BIASES = {  # keys of each kind of bias, those that may be left out after the others
+    "mass": (Mass, ("weight",), ()),
+    "spring": (Spring, ("preload", "stiffness"), ()),
+    "antagonist": (Antagonist, ("spacer",), ("voltage",)),
+    "bistable": (Bistable, ("middle", "offset", "rate", "cubic"), ()),
+    "tabulated": (Tabulated, ("displacement", "values"), ()),
+}
 WRINKLING = ("plain", "tension_field")
 
 
@@ -28,15 +39,18 @@ class CaseError(ValueError):
 
 @dataclass(frozen=True)
 class HistoryCase:
-    """A case along a history that can be solved."""
+    """A case along a history to be solved: of displacement ``h``, or of the ``share`` of a bias on a free disk."""
 
     specimen: Specimen
     t: list[float]
-    h: list[float]
+    h: list[float] | None
     voltage: list[float]
     times: list[float]
     tolerance: float
     sensitivities: bool
+    wrinkling: Wrinkling
+    bias: Bias | None = None
+    share: list[float] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +80,12 @@ def solve_cases(cases: Any) -> list[dict[str, Any]]:
     ``times``; the error is over the largest force of the history, and ``tolerance`` is 1e-6 when left out. With
     ``sensitivities`` true there is also ``dF``: derivatives of F, as `model.membrane.history.History.dforce`, lists
     over ``times``, of several parameters with a list each time. Without a history the film is the relaxed one.
+
+    Where the disk is free to move the history has a ``weight`` (N) in place of ``h``, that of a mass which hangs on it,
+    or neither, and the case has ``bias {kind, ...}``: "mass" with ``weight``, "spring" with ``preload, stiffness``,
+    "antagonist" with ``spacer, voltage`` (a second film like this one without its branches), "bistable" with ``middle,
+    offset, rate, cubic``, "tabulated" with ``displacement, values``, as in `model.actuator.bias`. Then ``h`` is a list
+    over ``times`` too, the error is that of ``h`` over the largest, and derivatives are those of h, ``dh``.
 
     Raises
     ------
@@ -100,19 +120,21 @@ def solve_cases(cases: Any) -> list[dict[str, Any]]:
 
 
 _FIELDS = {
+    "h": "h",
     "F": "force",
     "error_estimate": "error_estimate",
     "peak_field": "peak_field",
     "min_hoop_stress": "min_hoop_stress",
     "max_stretch": "max_stretch",
 }
-_ORDER = ("id", "status", *_FIELDS, "dF", "iterations", "message")
+_ORDER = ("id", "status", *_FIELDS, "dF", "dh", "iterations", "message")
 
 
 def _numbers(found: Solutions | None, at: int) -> dict[str, Any]:
+    fields = {key: name for key, name in _FIELDS.items() if name in Solutions.__dataclass_fields__}
     if found is None:
-        return dict.fromkeys(_FIELDS) | {"iterations": 0}
-    values = {key: float(getattr(found, name)[at]) for key, name in _FIELDS.items()}
+        return dict.fromkeys(fields) | {"iterations": 0}
+    values = {key: float(getattr(found, name)[at]) for key, name in fields.items()}
     return {key: value if math.isfinite(value) else None for key, value in values.items()} | {
         "iterations": int(found.iterations[at])
     }
@@ -120,15 +142,21 @@ def _numbers(found: Solutions | None, at: int) -> dict[str, Any]:
 
 def _along(case: HistoryCase) -> dict[str, Any]:
     """Answers of a case along a history."""
-    course = case.t, case.h, case.voltage, case.times
-    found = solve_history(case.specimen, *course, tolerance=case.tolerance, sensitivities=case.sensitivities)
+    how: Any = {"tolerance": case.tolerance, "sensitivities": case.sensitivities}
+    if case.bias is None:
+        course = case.t, case.h or [], case.voltage, case.times
+        found = solve_history(case.specimen, *course, **how, wrinkling=case.wrinkling)
+    else:
+        actuator = Actuator(case.specimen, case.bias, case.wrinkling)
+        found = creep(actuator, case.t, case.voltage, case.times, share=case.share or 1.0, **how)
     status = [Status(int(one)) for one in found.status]
     answer: dict[str, Any] = {"status": [one.name.lower() for one in status]}
     for key, name in _FIELDS.items():
-        if hasattr(found, name):
+        if hasattr(found, name) and (key != "h" or case.bias is not None):
             answer[key] = _or_none(getattr(found, name).tolist())
-    if found.dforce is not None:
-        answer["dF"] = {key: _or_none(value.tolist()) for key, value in found.dforce.items()}
+    for key, slopes in (("dF", found.dforce), ("dh", found.dh)):
+        if slopes is not None:
+            answer[key] = {name: _or_none(value.tolist()) for name, value in slopes.items()}
     lost = [one.message for one in status if one > Status.WRINKLED]
     return answer | {"iterations": found.steps} | ({"message": lost[0]} if lost else {})
 
@@ -147,9 +175,9 @@ def read_history_case(raw: Any) -> HistoryCase:
     ------
     CaseError, ValueError : the case does not describe a film or a history
     """
-    table = _table(raw, "the case", (*ALONG, "tolerance", "sensitivities"), ALONG)
-    history = _table(table["history"], "history", ("t", "h", "voltage"), ("t", "h"))
-    t, h, times = _list(history["t"], "history.t"), _list(history["h"], "history.h"), _list(table["times"], "times")
+    table = _table(raw, "the case", (*ALONG, "bias", "wrinkling", "tolerance", "sensitivities"), ALONG)
+    history = _table(table["history"], "history", ("t", *DRIVES, "voltage"), ("t",))
+    t, times = _list(history["t"], "history.t"), _list(table["times"], "times")
     voltage = _list(history.get("voltage", [0.0] * len(t)), "history.voltage")
     a, b, thickness, prestretch = (_number(table[key], key) for key in ("a", "b", "thickness", "prestretch"))
     film = Specimen(a, b, thickness, prestretch, _material(table["material"]))
@@ -157,7 +185,41 @@ def read_history_case(raw: Any) -> HistoryCase:
     slopes = table.get("sensitivities", False)
     if not isinstance(slopes, bool):
         raise CaseError(f"sensitivities must be true or false, not {_kind(slopes)}")
-    return HistoryCase(film, list(t), list(h), list(voltage), list(times), tolerance, slopes)
+    given = [key for key in DRIVES if key in history] + ["bias"] * ("bias" in table)
+    if not given:
+        raise CaseError("history lacks the key 'h', or 'weight' where the disk is free, or the case a 'bias'")
+    if len(given) > 1:
+        raise CaseError(f"the case has {' and '.join(given)}; a disk is held (h), or free under a weight or a bias")
+    case = HistoryCase(film, list(t), None, list(voltage), list(times), tolerance, slopes, _wrinkling(table))
+    if given == ["bias"]:
+        return replace(case, bias=_bias(table["bias"], film))
+    drive = list(_list(history[given[0]], f"history.{given[0]}"))
+    if given == ["h"]:
+        return replace(case, h=drive)
+    if min(drive, default=0.0) < 0.0:
+        raise CaseError(f"history.weight = {min(drive):g}: a weight is 0 or more; it pushes to positive h")
+    return replace(case, bias=Mass(1.0), share=drive)
+
+
+def _bias(raw: Any, film: Specimen) -> Bias:
+    """What pushes the disk."""
+    kind = raw.get("kind") if isinstance(raw, dict) else None
+    if isinstance(raw, dict) and not (isinstance(kind, str) and kind in BIASES):
+        raise CaseError(f"bias.kind = {kind!r}: allowed are {', '.join(BIASES)}")
+    law, needed, optional = BIASES[kind or "mass"]
+    table = _table(raw, "bias", ("kind", *needed, *optional), needed)
+    read = _list if law is Tabulated else _number
+    values: dict[str, Any] = {key: read(table[key], f"bias.{key}") for key in (*needed, *optional) if key in table}
+    if law is Antagonist:
+        values["film"] = film.with_material(replace(film.material, branches=()))
+    return cast(Bias, law(**values))
+
+
+def _wrinkling(table: dict[str, Any]) -> Wrinkling:
+    wrinkling = table.get("wrinkling", "plain")
+    if wrinkling not in WRINKLING:
+        raise CaseError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
+    return cast(Wrinkling, wrinkling)
 
 
 def read_case(raw: Any) -> Case:
@@ -169,9 +231,7 @@ def read_case(raw: Any) -> Case:
     """
     table = _table(raw, "the case", KEYS, ("id", *NUMBERS, "material"))
     material = _material(table["material"])
-    wrinkling = table.get("wrinkling", "plain")
-    if wrinkling not in WRINKLING:
-        raise CaseError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
+    wrinkling = _wrinkling(table)
     values = {key: _number(table[key], key) for key in NUMBERS}
     values |= {key: _number(table.get(key, default), key) for key, default in OPTIONAL.items()}
     if not 1e-12 <= values["tolerance"] <= 1e-2:
@@ -183,7 +243,7 @@ def read_case(raw: Any) -> Case:
         prestretch=values["prestretch"],
         material=material,
     )
-    return Case(film, values["h"], values["voltage"], values["tolerance"], cast(Wrinkling, wrinkling))
+    return Case(film, values["h"], values["voltage"], values["tolerance"], wrinkling)
 
 
 def _material(raw: Any) -> Material:

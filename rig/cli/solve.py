@@ -21,6 +21,10 @@ def command(cases: Path) -> None:
 
     CASES is a list of objects in SI units with id, a, b, thickness, prestretch, h, voltage, wrinkling ("plain" or
     "tension_field"), material {mu, alpha, eps_r} and optionally tolerance.
+
+    A film that takes time has material {..., branches: [{ratio, time_s}]}, history {t, h, voltage} and times in place
+    of h and voltage. Where its disk is free to move, history has weight (N) in place of h, or the case has bias
+    {kind, ...} (mass, spring, antagonist, bistable, tabulated): then h is among the answers.
     """
     from rig.analysis.cases import CaseError, solve_cases
     from rig.base.errors import ConfigError

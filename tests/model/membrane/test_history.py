@@ -20,9 +20,10 @@ from model.material.gent import Gent
 from model.material.materials import NAMED, Branch, Material
 from model.material.yeoh import Yeoh
 from model.membrane.history import History, at_once, solve_histories, solve_history
-from model.membrane.march import Course, March
+from model.membrane.march import Course, How, March
 from model.membrane.solve import Status, solve, solve_many
-from model.membrane.viscous import Films, Instant, State, balance
+from model.membrane.viscous import balance
+from model.membrane.viscous_films import Films, Instant, State
 from model.specimen import Specimen
 
 PARKER = NAMED["parker-cao2018"]
@@ -151,11 +152,11 @@ def test_error_falls_with_the_fourth_power_of_the_step() -> None:
     errors = []
     films = Films.of([specimen], 9)
     for count in (4, 8, 16):
-        march = March(films, [Course(t, h, voltage)], 1e-9)
+        march = March(films, [Course(t, h, voltage)], How(1e-9))
         for _ in range(count):
             step = march.step(np.array([8.0 / count]))
             march.accept(step, step.ok, step.begin + step.dt)
-        errors.append(abs(float(step.lam[0] * films.unit[0]) / exact - 1.0))
+        errors.append(abs(float(step.answer[0] * films.unit[0]) / exact - 1.0))
     ratios = [before / after for before, after in pairwise(errors)]
     assert min(ratios) > 11.0, errors  # 2^3.5
     assert errors[-1] > 1e-10  # the exact value is far better than what it judges
@@ -287,7 +288,7 @@ def in_steps(specimens: Sequence[Specimen], sensitivities: bool = False) -> tupl
     """Films pushed in three equal steps between bends, whatever their parameters."""
     t, h, voltage = (np.array(one, dtype=float) for one in PUSHED)
     films = Films.of(specimens, 7)
-    march = March(films, [Course(t, h, voltage)] * len(specimens), 1e-10, sensitivities)
+    march = March(films, [Course(t, h, voltage)] * len(specimens), How(1e-10, sensitivities))
     for left, right in pairwise(t.tolist()):
         for k in (1, 2, 3):
             step = march.step(np.full(len(specimens), (right - left) / 3.0))
@@ -401,7 +402,9 @@ def test_answers_between_solved_states_follow_them() -> None:
     ("t", "h", "voltage", "times", "tolerance", "words"),
     [
         ([0.0], [0.0], 0.0, None, 1e-6, "at least two times"),
-        ([0.0, 1.0, 1.0], [0.0, 1e-3, 1e-3], 0.0, None, 1e-6, "rise"),
+        ([0.0, 1.0, 1.0], [0.0, 1e-3, 2e-3], 0.0, None, 1e-6, "a jump at 1 s"),
+        ([1.0, 1.0], [0.0, 0.0], 0.0, None, 1e-6, "rise"),
+        ([0.0, 1.0, 0.5], [0.0, 1e-3, 2e-3], 0.0, None, 1e-6, "rise"),
         ([0.0, np.nan], [0.0, 1e-3], 0.0, None, 1e-6, "rise"),
         ([0.0, 1.0], [0.0, 1e-3, 2e-3], 0.0, None, 1e-6, "h has 3 values, t has 2"),
         ([0.0, 1.0], [0.0, np.inf], 0.0, None, 1e-6, "h holds a value that is not finite"),
@@ -417,6 +420,13 @@ def test_what_is_no_history_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=words):
         solve_history(film([(0.1, 1.0)]), t, h, voltage, times, tolerance=tolerance)  # type: ignore[arg-type]
+
+
+def test_a_hold_of_no_length_is_none() -> None:
+    specimen, times = film([(0.3, 2.0)]), [0.0, 1.0, 2.0]
+    twice = solve_history(specimen, [0, 1, 1, 2, 2], [0, 8e-3, 8e-3, 4e-3, 4e-3], 0.0, times, tolerance=1e-3)
+    once = solve_history(specimen, [0, 1, 2], [0, 8e-3, 4e-3], 0.0, times, tolerance=1e-3)
+    np.testing.assert_array_equal(twice.force, once.force)
 
 
 @pytest.mark.parametrize(

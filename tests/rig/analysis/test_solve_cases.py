@@ -149,6 +149,40 @@ def test_a_case_along_a_history() -> None:
     assert found[9]["F"] == pytest.approx(found[0]["F"], rel=1e-4)
 
 
+def test_a_case_of_a_free_disk() -> None:
+    """A weight that hangs on it is a bias of the kind mass; it sinks towards where the relaxed film carries it."""
+    geometry = {key: GOOD[key] for key in ("a", "b", "thickness", "prestretch")}
+    material = GOOD["material"] | {"branches": [{"ratio": 0.3, "time_s": 2.0}]}
+    free = geometry | {"id": "free", "material": material, "times": [0.0, 1.0, 4.0], "tolerance": 1e-3}
+    weight = free | {"history": {"t": [0, 4], "weight": [0.2, 0.2]}}
+    mass = free | {"history": {"t": [0, 4]}, "bias": {"kind": "mass", "weight": 0.2}, "wrinkling": "tension_field"}
+    bad = [
+        weight | {"bias": {"kind": "mass", "weight": 0.2}},
+        mass | {"bias": {"kind": "rope"}},
+        mass | {"bias": {"kind": "spring", "preload": 0.2}},
+        mass | {"bias": [0.2]},
+        mass | {"bias": {"kind": "mass", "weight": -1.0}},
+        free | {"history": {"t": [0, 4], "weight": [0.2, -0.2]}},
+        free | {"history": {"t": [0, 4], "weight": [0.2]}},
+    ]
+    hangs, pushed, *refused = solve_cases([weight, mass, *bad])
+    assert hangs["status"] == ["taut"] * 3 and hangs["F"] == [0.2] * 3
+    assert hangs["h"] == pytest.approx(pushed["h"], rel=1e-9)
+    assert 8e-3 < hangs["h"][0] < hangs["h"][1] < hangs["h"][2] < 9.63e-3  # the relaxed film is at 9.628 mm
+    assert all(0.0 < one < 1e-2 for one in hangs["error_estimate"])
+    words = (
+        "history.weight and bias",
+        "allowed are mass",
+        "lacks the key 'stiffness'",
+        "an object",
+        "positive",
+        "-0.2",
+    )
+    assert [one["status"] for one in refused] == ["invalid"] * len(bad)
+    for one, word in zip(refused, (*words, "h has 1 values"), strict=True):
+        assert word in one["message"], one["message"]
+
+
 def test_derivatives_along_a_history() -> None:
     """A list over the times, of several moduli a list each time; moduli and permittivity together scale the force."""
     branches = [{"ratio": 0.1, "time_s": 1.0}, {"ratio": 0.2, "time_s": 9.0}]
