@@ -52,6 +52,7 @@ ROWS: dict[int, Row] = {
         [
             "faults/test_processes.py::test_guard_killed",
             "faults/test_processes.py::test_guard_that_is_stopped_is_ended_and_replaced_by_the_engine",
+            "rig/safety/test_stopped.py::test_only_a_process_that_was_stopped_counts_as_stopped",
             "faults/test_hanging.py::test_taking_over_needs_no_lock_no_file_and_no_descriptor",
             "faults/test_serial_supply.py::test_killed",
         ],
@@ -133,6 +134,7 @@ ROWS: dict[int, Row] = {
         [
             "drivers/links/test_serial_link.py::test_every_way_to_vanish_at_every_call",
             "drivers/links/test_can_link.py::test_slcan_that_vanishes_is_lost",
+            "faults/test_one_way.py::test_the_off_goes_out_on_a_line_that_cannot_be_read",
             "faults/test_switches.py::test_the_run_ends_as_required",
         ],
     ),
@@ -209,6 +211,8 @@ ROWS: dict[int, Row] = {
         [
             "faults/test_processes.py::test_a_second_run_on_the_same_ports_is_refused_and_disturbs_nothing",
             "drivers/links/test_serial_link.py::test_lock_of_another_process_holds_until_it_is_killed",
+            "drivers/links/test_own_directory.py::test_nothing_is_made_in_the_directory_of_another_user",
+            "drivers/links/test_own_directory.py::test_a_port_without_a_place_for_its_lock_says_what_to_set",
         ],
     ),
     23: (
@@ -262,6 +266,7 @@ ROWS: dict[int, Row] = {
         [
             "faults/test_exit_paths.py::test_not_safe_is_never_hidden",
             "faults/test_exit_paths.py::test_and_never_said_otherwise",
+            "rig/safety/test_guard.py::test_an_output_that_is_called_off_and_drives_a_current_is_not_off",
         ],
     ),
     28: (
@@ -283,6 +288,7 @@ ROWS: dict[int, Row] = {
             "faults/test_hanging.py::test_a_writer_that_hangs_ends_the_run_and_is_not_left_behind",
             "faults/test_hanging.py::test_a_pipe_that_nobody_reads_holds_up_neither_the_run_nor_its_end",
             "faults/test_hanging.py::test_a_bus_full_of_other_frames_delays_nothing",
+            "rig/cli/test_streams.py::test_no_port_gets_the_number_of_a_closed_stream",
         ],
     ),
     30: (
