@@ -5,6 +5,7 @@ The same drivers sit on real ports and on a bench in memory; which it is has bee
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Protocol, cast
@@ -15,6 +16,12 @@ from rig.bench.devices import Link, make_device, make_supply
 from rig.bench.opening import Opened
 from rig.bench.tap import Tap
 from rig.scene.scene import Scene
+
+
+@functools.cache
+def _makes_remarks(kind: type[Device]) -> bool:
+    """Whether devices of this class are `Remarking`; comparing with a protocol takes too long for each turn."""
+    return issubclass(kind, Remarking)
 
 
 class SupplyProcess(Device, Protocol):
@@ -113,7 +120,7 @@ class Bench:
     def remarks(self, role: str) -> list[str]:
         """What a device has to say that the operator should know, since the last call."""
         device = self.devices[role]
-        return device.remarks() if isinstance(device, Remarking) else []
+        return cast(Remarking, device).remarks() if _makes_remarks(type(device)) else []
 
     def too_slow(self, role: str) -> str:
         """Why an instrument cannot give samples as often as the scene says, by its round trips so far; else nothing."""

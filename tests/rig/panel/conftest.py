@@ -72,6 +72,6 @@ def served(log: Path | None) -> Iterator[Caller]:
         panel.server_close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def serve() -> Callable[[Path | None], Any]:
     return served

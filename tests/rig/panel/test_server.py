@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,14 @@ from rig.log.writer import LogWriter
 LOGS = Path(str(files("sim_fixtures"))) / "logs"
 PAPER = LOGS / "paper" / "log.mcap"
 Serve = Callable[[Path | None], Any]
+
+
+@pytest.fixture(scope="module")
+def caller(serve: Serve) -> Iterator[Any]:
+    """One who asks a panel that has read the paper's log whole; nothing that is asked changes it."""
+    with serve(PAPER) as caller:
+        caller.wait(PAPER, lambda page: page["ended"])
+        yield caller
 
 
 def test_a_finished_log_is_shown_whole(serve: Serve) -> None:
@@ -97,20 +105,18 @@ def test_a_log_without_a_run_behind_it_is_old_and_its_voltage_unknown(serve: Ser
         ("POST", "/say", {"Host": "evil.example"}),
     ],
 )
-def test_who_is_not_the_page_is_refused(serve: Serve, method: str, path: str, headers: dict[str, str | None]) -> None:
-    with serve(PAPER) as caller:
-        body = {"log": str(PAPER), "text": "stop"} if method == "POST" else None
-        status, _, content = caller.ask(method, path, body, **headers)
+def test_who_is_not_the_page_is_refused(caller: Any, method: str, path: str, headers: dict[str, str | None]) -> None:
+    body = {"log": str(PAPER), "text": "stop"} if method == "POST" else None
+    status, _, content = caller.ask(method, path, body, **headers)
     assert status == 403 and b"{" not in content
 
 
-def test_the_token_becomes_a_cookie_and_leaves_the_address(serve: Serve) -> None:
-    with serve(PAPER) as caller:
-        status, headers, _ = caller.ask("GET", f"/?token={caller.panel.token}", Cookie=None)
-        assert status == 303 and headers["Location"] == "/"
-        assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
-        status, headers, page = caller.ask("GET", "/")
-        assert status == 200 and b"STOP" in page and "default-src 'none'" in headers["Content-Security-Policy"]
+def test_the_token_becomes_a_cookie_and_leaves_the_address(caller: Any) -> None:
+    status, headers, _ = caller.ask("GET", f"/?token={caller.panel.token}", Cookie=None)
+    assert status == 303 and headers["Location"] == "/"
+    assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
+    status, headers, page = caller.ask("GET", "/")
+    assert status == 200 and b"STOP" in page and "default-src 'none'" in headers["Content-Security-Policy"]
 
 
 @pytest.mark.parametrize(
@@ -124,19 +130,16 @@ def test_the_token_becomes_a_cookie_and_leaves_the_address(serve: Serve) -> None
         ({"log": str(PAPER.resolve()), "text": "stop"}, 409),  # the run of this log has ended
     ],
 )
-def test_a_bad_request_is_refused_and_the_server_goes_on(serve: Serve, body: object, status: int) -> None:
-    with serve(PAPER) as caller:
-        assert caller.ask("POST", "/say", body)[0] == status
-        assert caller.data(PAPER)["log"] == "log.mcap"
+def test_a_bad_request_is_refused_and_the_server_goes_on(caller: Any, body: object, status: int) -> None:
+    assert caller.ask("POST", "/say", body)[0] == status
+    assert caller.data(PAPER)["log"] == "log.mcap"
 
 
 @pytest.mark.parametrize(
     "seen", [{"loop": "x"}, {"force_mN": [1]}, {"force_mN": [0, -5]}, {"loop": [0, 10**9]}, {"x": None}]
 )
-def test_nonsense_about_what_was_seen_gets_everything(serve: Serve, seen: dict[str, Any]) -> None:
-    with serve(PAPER) as caller:
-        caller.wait(PAPER, lambda page: page["ended"])
-        page = caller.data(PAPER, **seen)
+def test_nonsense_about_what_was_seen_gets_everything(caller: Any, seen: dict[str, Any]) -> None:
+    page = caller.data(PAPER, **seen)
     assert page["loop"]["first"] == 0 and page["traces"]["force_mN"]["first"] == 0
 
 
