@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.elsewhere import dea_rig
 from tests.protocols import TO_THE_FILM
 
 HERE = Path(__file__).parent
@@ -63,18 +64,13 @@ class Place:
     def environment(self) -> dict[str, str]:
         return {**os.environ, "PYTHONPATH": f"{self.packages}{os.pathsep}{HERE.parent}"}
 
-    def rig(self, *arguments: str, code: int = 0) -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", "rig", *arguments],
-            capture_output=True,
-            text=True,
-            cwd=self.folder,
-            env=self.environment,
-            timeout=100,
-        )
-        assert done.returncode == code, done.stdout + done.stderr
-        assert "Traceback" not in done.stderr
-        return done.stdout + done.stderr
+    def told(self, *commands: str, codes: tuple[int, ...] = ()) -> list[str]:
+        """What each command says, one after the other in one process; each ends with its code, or with 0."""
+        done = dea_rig(self.environment["PYTHONPATH"], *(command.split() for command in commands), cwd=self.folder)
+        for one, code in zip(done, codes or [0] * len(done), strict=True):
+            assert one.returncode == code, one.all
+            assert "Traceback" not in one.stderr
+        return [one.all for one in done]
 
 
 @pytest.fixture
@@ -114,38 +110,40 @@ def ports(place: Place) -> Iterator[dict[str, dict[str, str]]]:
 
 
 def test_a_scene_a_run_and_a_replay_know_it(place: Place) -> None:
-    place.rig("check", "scene.toml", "protocol.toml")
-    place.rig("run", "scene.toml", "protocol.toml", "-o", "a.mcap")
-    assert "model ACME, serial 4711, firmware 1.0" in place.rig("info", "a.mcap")
-    assert "every sample comes out as recorded" in place.rig("replay", "--verify", "a.mcap")
-    assert "the run ends as it did" in place.rig("replay", "--rerun", "a.mcap")
+    place.told("check scene.toml protocol.toml", "run scene.toml protocol.toml -o a.mcap")
+    info, verified, again = place.told("info a.mcap", "replay --verify a.mcap", "replay --rerun a.mcap")
+    assert "model ACME, serial 4711, firmware 1.0" in info
+    assert "every sample comes out as recorded" in verified
+    assert "the run ends as it did" in again
 
 
 def test_its_keys_and_faults_are_checked(place: Place) -> None:
     scene = (place.folder / "scene.toml").read_text()
-    (place.folder / "scene.toml").write_text(scene.replace('serial = "4711"', "rate_Hz = 200.0"))
-    assert "rate_Hz = 200.0: it must be at most 100" in place.rig("check", "scene.toml", "protocol.toml", code=2)
     fault = '\n[[simulation.fault]]\nrole = "force"\nkind = "{}"\n'
-    (place.folder / "scene.toml").write_text(scene + fault.format("no_value"))
-    assert "drift" in place.rig("check", "scene.toml", "protocol.toml", code=2)
-    (place.folder / "scene.toml").write_text(scene + fault.format("drift"))
-    place.rig("check", "scene.toml", "protocol.toml")
+    (place.folder / "rate.toml").write_text(scene.replace('serial = "4711"', "rate_Hz = 200.0"))
+    (place.folder / "other.toml").write_text(scene + fault.format("no_value"))
+    (place.folder / "own.toml").write_text(scene + fault.format("drift"))
+    rate, other, _ = place.told(
+        *(f"check {name}.toml protocol.toml" for name in ("rate", "other", "own")), codes=(2, 2, 0)
+    )
+    assert "rate_Hz = 200.0: it must be at most 100" in rate
+    assert "drift" in other
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are POSIX")
 def test_it_is_served_found_and_run_on_its_port(place: Place, ports: dict[str, dict[str, str]]) -> None:
-    found = place.rig("devices", "--port", ports["force"]["port"])
+    (found,) = place.told(f"devices --port {ports['force']['port']}")
     assert "ACME" in found and "acme-scale" in found and "4711" in found
-    place.rig("run", "scene.toml", "protocol.toml", "--ports", "ports.json", "--yes", "-o", "a.mcap")
-    assert "every sample comes out as recorded" in place.rig("replay", "--verify", "a.mcap")
+    place.told("run scene.toml protocol.toml --ports ports.json --yes -o a.mcap")
+    assert "every sample comes out as recorded" in place.told("replay --verify a.mcap")[0]
 
 
 def test_a_package_that_cannot_be_imported_stops_nobody_who_does_not_name_it(place: Place) -> None:
     (place.packages / "acme_scale.py").write_text("import no_such_module\n")
-    told = place.rig("check", "scene.toml", "protocol.toml", code=2)
+    own = f"check {FIXTURES / 'scenes' / 'no-hv.toml'} {FIXTURES / 'protocols' / 'passive.toml'}"
+    told, _ = place.told("check scene.toml protocol.toml", own, codes=(2, 0))
     assert "acme-scale" in told and "no_such_module" in told
-    place.rig("check", str(FIXTURES / "scenes" / "no-hv.toml"), str(FIXTURES / "protocols" / "passive.toml"))
 
 
 @pytest.mark.slow
@@ -159,5 +157,5 @@ def test_it_is_installed_by_pip(place: Place, tmp_path: Path) -> None:
         check=True,
         timeout=100,
     )
-    place.rig("run", "scene.toml", "protocol.toml", "-o", "a.mcap")
-    assert "every sample comes out as recorded" in place.rig("replay", "--verify", "a.mcap")
+    _, verified = place.told("run scene.toml protocol.toml -o a.mcap", "replay --verify a.mcap")
+    assert "every sample comes out as recorded" in verified

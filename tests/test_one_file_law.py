@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import os
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
+
+from tests import elsewhere
 
 FIXTURES = Path(str(files("sim_fixtures")))
 ROOT = Path(__file__).resolve().parents[1]
@@ -82,14 +83,12 @@ def package(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def dea_rig(package: Path, *arguments: str, fails: bool = False) -> str:
-    """Output of the command in a fresh process that has the package."""
-    code = f"import sys; sys.path[:0] = [{str(package)!r}, {str(ROOT)!r}]; from rig.cli.app import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=package, timeout=300
-    )
-    assert (done.returncode != 0) == fails, done.stdout + done.stderr
-    return done.stdout + done.stderr
+def dea_rig(package: Path, *commands: list[str | Path], fails: bool = False) -> list[str]:
+    """Outputs of the commands in a fresh process that has the package."""
+    done = elsewhere.dea_rig(f"{package}{os.pathsep}{ROOT}", *commands, cwd=package)
+    for one in done:
+        assert (one.returncode != 0) == fails, one.all
+    return [one.all for one in done]
 
 
 def test_solve_knows_it(package: Path) -> None:
@@ -102,7 +101,7 @@ def test_solve_knows_it(package: Path) -> None:
     ]
     path = package / "cases.json"
     path.write_text(json.dumps(cases))
-    first, second, third = json.loads(dea_rig(package, "solve", str(path)))
+    first, second, third = json.loads(dea_rig(package, ["solve", path])[0])
     assert first["status"] == "taut" and first["F"] == pytest.approx(second["F"], rel=1e-7)
     assert third["F"] > 1.1 * second["F"]
 
@@ -111,9 +110,8 @@ def test_a_scene_with_it_is_checked_run_and_fitted(package: Path) -> None:
     scene, log, out = package / "scene.toml", package / "run.mcap", package / "fit.json"
     scene.write_text(SCENE.replace("CERTIFICATE", str(FIXTURES / "calibrations" / "force.toml")))
     protocol = FIXTURES / "protocols" / "passive.toml"
-    dea_rig(package, "check", str(scene), str(protocol))
-    dea_rig(package, "run", str(scene), str(protocol), "-o", str(log), "--yes")
-    told = dea_rig(package, "fit", str(log), "-o", str(out))
+    dea_rig(package, ["check", scene, protocol], ["run", scene, protocol, "-o", log, "--yes"])
+    (told,) = dea_rig(package, ["fit", log, "-o", out])
     assert "Demiray law" in told, told
     found = json.loads(out.read_text())
     assert found["law"] == "demiray"
@@ -125,7 +123,7 @@ def test_a_scene_with_it_is_checked_run_and_fitted(package: Path) -> None:
 def test_errors_name_its_keys_only(package: Path) -> None:
     scene = package / "scene.toml"
     scene.write_text(SCENE.replace("eps_r = 2.0", "eps_r = 2.0\nalpha = [2.0]"))
-    told = dea_rig(package, "check", str(scene), str(FIXTURES / "protocols" / "passive.toml"), fails=True)
+    (told,) = dea_rig(package, ["check", scene, FIXTURES / "protocols" / "passive.toml"], fails=True)
     assert "alpha" in told and "mu_Pa" in told and "Jm" not in told
 
 
@@ -138,6 +136,6 @@ def test_a_law_that_cannot_be_used_stops_nobody_who_does_not_need_it(package: Pa
     ]
     path = package / "cases.json"
     path.write_text(json.dumps(cases))
-    first, second = json.loads(dea_rig(package, "solve", str(path)))
+    first, second = json.loads(dea_rig(package, ["solve", path])[0])
     assert first["status"] == "invalid" and "acme-demiray" in first["message"] and "no such thing" in first["message"]
     assert second["status"] == "taut"

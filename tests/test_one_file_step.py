@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
+
+from rig.log.dataset import load_run
+from tests.elsewhere import dea_rig
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 STEP = '''
@@ -71,12 +71,6 @@ do = "return"
 """
 
 
-def dea_rig(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "160"}
-    command = [sys.executable, "-m", "rig", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=110)
-
-
 @pytest.fixture
 def other_package(tmp_path: Path) -> Path:
     (tmp_path / "knocking.py").write_text(STEP)
@@ -90,39 +84,32 @@ def other_package(tmp_path: Path) -> Path:
 
 def test_the_step_is_checked_run_recorded_and_replayed(other_package: Path) -> None:
     scene, protocol, log = SCENES / "no-hv.toml", other_package / "protocol.toml", other_package / "run.mcap"
-    checked = dea_rig(other_package, "check", scene, protocol)
+    checked, told, done = dea_rig(
+        str(other_package), ["check", scene, protocol], ["keys", "knock"], ["run", scene, protocol, "-o", log]
+    )
     assert checked.returncode == 0, checked.stderr
     assert "knock: knock 3" in checked.stdout
-    told = dea_rig(other_package, "keys", "knock")
     assert told.returncode == 0 and "How deep (mm). Typical: 0.5 to 1." in told.stdout, told.stderr
-    done = dea_rig(other_package, "run", scene, protocol, "-o", log)
     assert done.returncode == 0, done.stderr
-    replayed = dea_rig(other_package, "replay", log)
-    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
-    look = (
-        "from pathlib import Path\nfrom rig.log.dataset import load_run\n"
-        f"run = load_run(Path({str(log)!r}), {{}})\n"
-        "told = [(p.cycle, p.direction) for p in run.phases if p.kind == 'knock' and p.record]\n"
-        "print(told, max(h for h in run.h if h == h) > 2.3e-3)"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(other_package)}
-    told = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, env=environment, timeout=60)
-    assert told.stdout == "[(1, 1), (2, 1), (3, 1)] True\n", told.stderr
+    (replayed,) = dea_rig(str(other_package), ["replay", log])
+    assert replayed.returncode == 0, replayed.all
+    run = load_run(log, {})
+    assert [(p.cycle, p.direction) for p in run.phases if p.kind == "knock" and p.record] == [(1, 1), (2, 1), (3, 1)]
+    assert max(h for h in run.h if h == h) > 2.3e-3
 
 
 def test_its_errors_list_its_own_keys_and_its_plan_refuses_in_the_family(other_package: Path) -> None:
-    protocol = other_package / "protocol.toml"
-    protocol.write_text(PROTOCOL.replace("times = 3", "time = 3"))
-    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
-    assert done.returncode == 2
-    assert "step 4, time: unknown key; did you mean times? Allowed here: depth_mm, do, times." in done.stderr
-    protocol.write_text(PROTOCOL.replace("depth_mm = 0.8", "depth_mm = 3"))
-    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
-    where = f"{protocol} on {SCENES / 'no-hv.toml'}"
-    assert (done.returncode, done.stderr) == (3, f"{where}: Step 4 (knock): more than 1 mm is no knock.\n")
-    protocol.write_text(PROTOCOL.replace('"knock"', '"knok"'))
-    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
-    assert done.returncode == 2 and 'did you mean "knock"?' in done.stderr
+    changes = [("times = 3", "time = 3"), ("depth_mm = 0.8", "depth_mm = 3"), ('"knock"', '"knok"')]
+    protocols = [other_package / f"protocol-{number}.toml" for number in range(len(changes))]
+    for path, change in zip(protocols, changes, strict=True):
+        path.write_text(PROTOCOL.replace(*change))
+    scene = SCENES / "no-hv.toml"
+    key, depth, name = dea_rig(str(other_package), *(["check", scene, protocol] for protocol in protocols))
+    assert key.returncode == 2
+    assert "step 4, time: unknown key; did you mean times? Allowed here: depth_mm, do, times." in key.stderr
+    where = f"{protocols[1]} on {scene}"
+    assert (depth.returncode, depth.stderr) == (3, f"{where}: Step 4 (knock): more than 1 mm is no knock.\n")
+    assert name.returncode == 2 and 'did you mean "knock"?' in name.stderr
 
 
 @pytest.mark.parametrize(
@@ -137,12 +124,12 @@ def test_one_that_cannot_be_loaded_names_its_package_and_leaves_other_protocols_
     other_package: Path, spoilt: str, words: str
 ) -> None:
     (other_package / "knocking.py").write_text(spoilt)
-    protocol = other_package / "protocol.toml"
-    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
+    scene, protocol, without = SCENES / "no-hv.toml", other_package / "protocol.toml", other_package / "without.toml"
+    without.write_text(PROTOCOL.split('[[step]]\ndo = "knock"')[0])
+    done, other = dea_rig(str(other_package), ["check", scene, protocol], ["check", scene, without])
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "package knocking-for-rigs" in done.stderr and words in done.stderr
-    protocol.write_text(PROTOCOL.split('[[step]]\ndo = "knock"')[0])
-    assert dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol).returncode == 0
+    assert other.returncode == 0, other.stderr
 
 
 def test_a_name_of_the_programs_own_is_not_taken_over(other_package: Path) -> None:
@@ -150,5 +137,5 @@ def test_a_name_of_the_programs_own_is_not_taken_over(other_package: Path) -> No
     about.write_text("[dea_rig.steps]\nhome = knocking:Knock\n")
     protocol = other_package / "protocol.toml"
     protocol.write_text('[[step]]\ndo = "home"\n')
-    done = dea_rig(other_package, "check", SCENES / "no-hv.toml", protocol)
+    (done,) = dea_rig(str(other_package), ["check", SCENES / "no-hv.toml", protocol])
     assert done.returncode == 0 and "find the reference position" in done.stdout

@@ -31,9 +31,10 @@ from tests.protocols import TO_THE_FILM
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 # The film of the scenes, so near that the way to it is short.
 NEARER = {
-    "approach_from_mm = 36.0": "approach_from_mm = 13.0",
-    "contact_position_mm = 40.0": "contact_position_mm = 17.0",
+    "approach_from_mm = 36.0": "approach_from_mm = 3.0",
+    "contact_position_mm = 40.0": "contact_position_mm = 4.0",
 }
+NEAR_HOME = "\n[simulation.stage]\nstart_position_mm = 1.0\n"
 PROTOCOL = (
     TO_THE_FILM
     + """[[step]]
@@ -127,6 +128,8 @@ def tell(tmp_path: Path) -> Tell:
                 text = text.replace(*pair)
         for far, near in NEARER.items() if nearer else ():
             text = text.replace(far, near)
+        if nearer and "[simulation.stage]" not in text:
+            text += NEAR_HOME
         parsed = parse_table(text, Scene, "scene", "test")
         actions = plan(parse_table(protocol, Protocol, "protocol", "test"), parsed)
         if checked:

@@ -31,7 +31,7 @@ from tests.protocols import TO_THE_FILM
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 Tell = Callable[..., Any]  # of conftest.Story
-CONTACT_MM = 17.0
+CONTACT_MM = 4.0
 HEAD = TO_THE_FILM
 MOVE_INTO_THE_FIELD_LIMIT = (
     HEAD
@@ -71,7 +71,7 @@ def furthest_mm(story: Any) -> float:
 def test_a_move_into_the_field_limit_is_refused_before_the_stage_moves(tell: Tell) -> None:
     story = tell(protocol=MOVE_INTO_THE_FIELD_LIMIT, checked=False)
     assert isinstance(story.error, LimitError) and "field" in str(story.error), story.error
-    assert furthest_mm(story) < 2.0 and story.bench.world.stage.at(story.end)[0] < 41e-3
+    assert furthest_mm(story) < 2.0 and story.bench.world.stage.at(story.end)[0] < (CONTACT_MM + 2.0) * 1e-3
     assert max(volts for _, volts in story.outputs) > 1490 and abs(story.final_output) < 60
 
 
@@ -86,7 +86,7 @@ def test_a_film_that_is_moved_by_somebody_else_is_cut_off_at_its_field_limit(tel
 
     def push(bench: SimulatedBench, control: Control) -> None:
         now = bench.now
-        bench.world.stage.ramp(now, 47e-3, 20e-3)
+        bench.world.stage.ramp(now, (CONTACT_MM + 30.0) * 1e-3, 20e-3)
 
     story = tell(push, replace=("field_V_per_um = 80.0", "field_V_per_um = 44.0"))
     assert isinstance(story.error, LimitError) and "Film, as measured: field" in str(story.error), story.error
@@ -120,13 +120,13 @@ def test_a_voltage_that_would_store_too_much_energy_is_refused(tell: Tell, old: 
         ),
         ("approach_from_mm = 36.0", "approach_from_mm = 160.0", "approach_from_mm, for this stage"),
         ("approach_from_mm = 36.0", "approach_from_mm = 1.0", "Clearance of the return step"),
-        ("[simulation.film]", "[simulation.stage]\ntravel_mm = 18.0\n[simulation.film]", "Largest displacement"),
+        ("[simulation.film]", "[simulation.stage]\ntravel_mm = 41.0\n[simulation.film]", "Largest displacement"),
     ],
 )
 def test_what_the_devices_cannot_do_is_refused_before_anything_moves(
     tell: Tell, old: str, new: str, words: str
 ) -> None:
-    story = tell(replace=(old, new))
+    story = tell(replace=(old, new), nearer=False)
     assert isinstance(story.error, LimitError) and words in str(story.error), story.error
     assert not {"home", "move_to"} & set(story.stage_words) and not story.control_words
     assert story.bench.world.stage.at(story.end)[0] == pytest.approx(12e-3)  # where it was switched on

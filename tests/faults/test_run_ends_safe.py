@@ -136,8 +136,8 @@ def test_a_sensor_far_off_at_zero_is_refused(tell: Tell) -> None:
 
 
 def test_a_film_met_before_the_approach_begins_is_a_fault(tell: Tell) -> None:
-    story = tell(replace=("contact_position_mm = 40.0", "contact_position_mm = 10.0"))
-    assert isinstance(story.error, FaultError) and "met something before 13 mm" in story.outcome.reason
+    story = tell(replace=("contact_position_mm = 40.0", "contact_position_mm = 1.5"))
+    assert isinstance(story.error, FaultError) and "met something before 3 mm" in story.outcome.reason
 
 
 def test_an_instrument_with_another_serial_number_is_refused_before_anything_moves(tell: Tell) -> None:

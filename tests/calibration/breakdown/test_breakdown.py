@@ -83,17 +83,25 @@ def covered(interval: Interval, truth: float) -> bool:
     return interval.low <= truth <= interval.high
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("count", "least", "most"),
+    [
+        pytest.param(60, 0.85, 1.0, marks=pytest.mark.slow),  # wider by chance
+        pytest.param(200, 0.90, 0.99, marks=pytest.mark.long),
+    ],
+)
 @pytest.mark.parametrize("how", ["strongest", "random", "ceiling"])
-def test_95_percent_intervals_cover_in_90_to_99_percent_of_200_campaigns_of_ten(how: str) -> None:
+def test_95_percent_intervals_cover_the_truth_in_so_many_campaigns_of_ten(
+    how: str, count: int, least: float, most: float
+) -> None:
     rng = np.random.default_rng(5)
-    campaigns = [one for one in (campaign(rng, 10, how) for _ in range(200)) if one.usable]
+    campaigns = [one for one in (campaign(rng, 10, how) for _ in range(count)) if one.usable]
     fits: list[WeibullFit] = [fit_weibull(one, rng, 200) for one in campaigns]
     low = TRUE_SCALE * (-math.log(0.9)) ** (1 / SHAPE)
     for name, truth in (("scale", TRUE_SCALE), ("shape", SHAPE), ("low_quantile", low)):
         for kind in ("profile", "bootstrap"):
             share = np.mean([covered(getattr(getattr(one, name), kind), truth) for one in fits])
-            assert 0.90 <= share <= 0.99, (how, name, kind, share)
+            assert least <= share <= most, (how, name, kind, share)
 
 
 def test_intervals_of_the_scale_cover_in_a_few_campaigns() -> None:

@@ -78,7 +78,7 @@ def test_a_wrong_model_that_biases_the_permittivity_is_found_out(
     ("suspect", "ratio", "tau"),
     [
         ("compliance of the rig", 0.0, 1.0),
-        ("relaxation time near 3 s", 0.35, 3.0),
+        pytest.param("relaxation time near 3 s", 0.35, 3.0, marks=pytest.mark.long),
         ("relaxation time near 30 s", 0.37, 30.0),
     ],
 )

@@ -223,9 +223,14 @@ def independent_best(tests: list[HomogeneousTest], terms: int, relative: bool) -
     )
 
 
-@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("relative", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    "name", ["treloar1944_uniaxial", "vhb4910_uniaxial_equilibrium_hossain2012", "treloar1944_equibiaxial"]
+    "name",
+    [
+        pytest.param("treloar1944_uniaxial", marks=pytest.mark.slow),
+        "vhb4910_uniaxial_equilibrium_hossain2012",
+        pytest.param("treloar1944_equibiaxial", marks=pytest.mark.slow),
+    ],
 )
 def test_the_optimum_is_the_best_that_an_independent_search_finds(name: str, relative: bool) -> None:
     if not DATA.is_dir():
@@ -239,8 +244,10 @@ def test_the_optimum_is_the_best_that_an_independent_search_finds(name: str, rel
 @pytest.mark.parametrize(
     "files",
     [
-        ["treloar1944_uniaxial", "treloar1944_equibiaxial", "treloar1944_pure_shear"],
-        ["kawabata1981_biaxial"],
+        pytest.param(
+            ["treloar1944_uniaxial", "treloar1944_equibiaxial", "treloar1944_pure_shear"], marks=pytest.mark.slow
+        ),
+        pytest.param(["kawabata1981_biaxial"], marks=pytest.mark.slow),
         ["vhb4910_uniaxial_equilibrium_hossain2012"],
     ],
 )

@@ -24,7 +24,7 @@ def runs(status: np.ndarray) -> list[str]:
     return [Status(value).name for value, _ in groupby(status.tolist())]
 
 
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-5, 1e-6])
+@pytest.mark.parametrize("tolerance", [1e-4, pytest.param(1e-5, marks=pytest.mark.slow), 1e-6])
 def test_no_state_where_the_relaxed_law_falls(tolerance: float) -> None:
     assert solve(STIFFENING, H, 545.738, tolerance=tolerance, wrinkling="tension_field").status is Status.UNSTABLE
 
@@ -38,7 +38,7 @@ def test_the_statuses_along_the_voltage_change_once() -> None:
     assert np.all(np.diff(found.force[found.answered]) < 0.0)
 
 
-@pytest.mark.parametrize("tolerance", [1e-8, 1e-6, 1e-4])
+@pytest.mark.parametrize("tolerance", [pytest.param(1e-8, marks=pytest.mark.slow), 1e-6, 1e-4])
 def test_between_loss_of_convexity_and_slack_no_voltage_has_an_answer(tolerance: float) -> None:
     """At 1812.87 V the energy is convex at every point of a state that is there; the branch has ended before."""
     soft = Specimen(4e-3, 20e-3, 40e-6, 1.2, Material("soft", (8e4,), (2.5,), 2.5))

@@ -45,7 +45,13 @@ EXTREMES = {
 }
 
 
-@pytest.mark.parametrize("name", EXTREMES)
+# The others take the reference seconds each.
+QUICK = ("disk nearly as large as the ring", "disk of a hundred-thousandth, little raised", "exponent -20", "thinnest")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in EXTREMES]
+)
 def test_extreme(name: str) -> None:
     specimen, h = EXTREMES[name]
     answer = solve(specimen, h, tolerance=1e-8)

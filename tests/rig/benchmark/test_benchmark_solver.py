@@ -148,6 +148,7 @@ def test_cases_are_taut_and_the_same_every_time() -> None:
     assert truth.converged.all()
 
 
+@pytest.mark.slow
 def test_extremes_count_every_state_and_write_files(tmp_path: Path) -> None:
     families = ["no pre-stretch, h from 1 nm to 3 b", "shear modulus from 100 Pa to 1 GPa"]
     report = extremes.measure(4, families=families)

@@ -353,6 +353,7 @@ def test_too_large_and_binary_files_are_refused_before_they_are_parsed(
         read_sheet_tests([tmp_path / "none.csv"])
 
 
+@pytest.mark.slow
 def test_two_hundred_thousand_rows_take_seconds(tmp_path: Path) -> None:
     import time
 

@@ -97,13 +97,8 @@ def test_without_arm_there_is_no_high_voltage_and_no_log(scene: Path, ports: Pat
     assert not list(tmp_path.glob("*.mcap*"))
 
 
-@pytest.mark.parametrize(
-    "number",
-    [
-        signal.SIGINT,
-        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_signal_ends_a_run_safely(
     scene: Path, live_soon: Path, ports: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
