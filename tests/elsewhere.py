@@ -48,7 +48,7 @@ def dea_rig(path: str, *commands: list[str | Path], cwd: Path | None = None) -> 
         text=True,
         cwd=cwd,
         env={**os.environ, "PYTHONPATH": path, "COLUMNS": "160"},
-        timeout=110,
+        timeout=110 * len(commands),
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return [Told(*json.loads(line)) for line in done.stdout.splitlines()]

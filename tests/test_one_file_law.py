@@ -57,12 +57,15 @@ displacement_mm = 14.0
 speed_mm_per_s = 5.0
 [stage]
 driver = "zaber"
-approach_from_mm = 36.0
+approach_from_mm = 5.0
 [force]
 driver = "gsv8"
 certificate = "CERTIFICATE"
 [simulation]
 seed = 3
+contact_position_mm = 7.0
+[simulation.stage]
+start_position_mm = 2.0
 [simulation.force]
 full_scale_N = 1.0
 [simulation.film]

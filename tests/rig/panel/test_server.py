@@ -28,9 +28,8 @@ def caller(serve: Serve) -> Iterator[Any]:
         yield caller
 
 
-def test_a_finished_log_is_shown_whole(serve: Serve) -> None:
-    with serve(PAPER) as caller:
-        page = caller.wait(PAPER, lambda page: page["ended"] and page["outlook"])
+def test_a_finished_log_is_shown_whole(caller: Any) -> None:
+    page = caller.wait(PAPER, lambda page: page["ended"] and page["outlook"])
     log = read_log(PAPER)
     assert page["state"] == "SAFE" and page["simulated"] and page["outcome"]["status"] == "complete"
     force = log.columns("/force/sample")
@@ -43,13 +42,12 @@ def test_a_finished_log_is_shown_whole(serve: Serve) -> None:
     assert page["phases"] == len(page["outlook"]["steps"])
 
 
-def test_the_loop_lies_where_force_and_displacement_were_at_the_same_time(serve: Serve) -> None:
+def test_the_loop_lies_where_force_and_displacement_were_at_the_same_time(caller: Any) -> None:
     """Against the aligned data set, which is made another way."""
     from rig.log.dataset import load_run
 
     run = load_run(PAPER)
-    with serve(PAPER) as caller:
-        points = caller.wait(PAPER, lambda page: page["ended"])["loop"]["points"]
+    points = caller.wait(PAPER, lambda page: page["ended"])["loop"]["points"]
     assert len(points) > 100
     for h, force, _ in points[::7]:
         near = abs(run.h * 1e3 - h) < 0.05
