@@ -357,7 +357,7 @@ class _Answer:
         else:
             number, share = np.zeros(len(times), dtype=np.intp), h
             h = np.where(answered & (share == 0.0), 0.0, specimen.ring_radius * rows[0])
-            force = share * how.push(number, h)[0]
+            force = np.where(answered, share * how.push(number, h)[0], np.nan)
             if how.sensitivities:
                 dh = _with_units_free(specimen, specimen.ring_radius * rows[ROWS:])
         largest = max(float(np.nanmax(np.abs(force if how.push is None else h), initial=0.0)), self.scale)

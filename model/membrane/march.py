@@ -49,6 +49,7 @@ LIFTS = (
     *np.geomspace(0.01, 2.0, 24).tolist(),
 )  # heights over the ring radius, to begin with under a load
 SLACK_SHARE = 0.05  # of the largest meridional stress, force or load: with less a film hangs slack next
+FARTHEST = 4.0  # lengths of a last step over which a first state is drawn on beyond a bend
 JUMP = 0.2  # change of a logarithmic stretch from stage to stage that is none of the time that passes
 NEAR_SNAP = 0.2  # of the film's stiffness: with less left over the load's a free disk jumps next
 LEAST_STEP = 1e-5  # of the shorter of a stretch of the history and the shortest relaxation time: the same
@@ -160,7 +161,7 @@ def _extrapolated(times: Sequence[Array], values: Sequence[Array], at: Array, fr
         w0 = (at - t1) * (at - t2) / ((t0 - t1) * (t0 - t2))
         w1 = (at - t0) * (at - t2) / ((t1 - t0) * (t1 - t2))
         line = (at - t2) / (t1 - t2)
-    line = np.where(t1 == t2, 0.0, line)
+    line = np.where((t1 == t2) | (np.abs(line) > FARTHEST), 0.0, line)
     w0, w1 = np.where(fresh, 0.0, w0), np.where(fresh, line, w1)
     found: Array = w0 * values[0] + w1 * values[1] + (1.0 - w0 - w1) * values[2]
     return found

@@ -446,6 +446,17 @@ def test_beyond_pull_in_there_is_a_status_and_no_number() -> None:
     assert np.isnan(found.force[2]) and np.isnan(found.error_estimate[2]) and np.isnan(found.peak_field[2])
 
 
+def test_a_move_of_no_time_and_a_hold_of_years() -> None:
+    """What comes after a move of a nanosecond is the film pushed at once, and at last the relaxed one."""
+    specimen = film([(0.3, 2.0)])
+    t, h = [0.0, 1e-9, 4.0, 1e9], [0.0, 8e-3, 8e-3, 8e-3]
+    found = solve_history(specimen, t, h, 0.0, tolerance=1e-4)
+    assert (found.status == Status.TAUT).all()
+    assert found.force[1] == pytest.approx(at_once(specimen, 8e-3), rel=1e-5)
+    assert found.force[1] > found.force[2] > found.force[3]
+    assert found.force[3] == pytest.approx(solve(specimen, 8e-3).force, rel=1e-4)
+
+
 def test_a_film_that_its_branches_push_slack_has_a_status_and_no_number() -> None:
     """Pushed, held and pulled back at once, a film without pre-stretch is too long for its frame."""
     specimen = film([(2.0, 1.0)], lp=1.0)
