@@ -183,3 +183,24 @@ def test_a_film_that_softens_and_relaxes_is_told_apart() -> None:
     (branch,) = found.spectrum.branches
     assert abs(branch.ratio - 0.2) < 3.0 * branch.ratio_uncertainty
     assert abs(math.log(branch.time / 8.0)) < 3.0 * branch.time_relative
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_where_a_film_hangs_slack_its_forces_are_left_out() -> None:
+    """A strong branch that has relaxed in a hold pushes on the way back: the film hangs, and reads as no force."""
+    cone = ViscousCone(branches=((1.0, 10.0),), **ONE_TERM)
+    curves = run(cone, paper((0.0,), hold=60.0, speed=6e-3), 1, rate=50.0)
+    down = np.concatenate([one.direction for one in curves]) < 0
+    force = np.concatenate([one.force for one in curves])
+    assert (np.abs(force[down]) < 4e-3).mean() > 0.1  # or it would tell nothing
+    found, relaxed = identify_branches(records(curves), curves, terms=1, branches=1)
+    assert found.spectrum is not None
+    (branch,) = found.spectrum.branches
+    assert abs(branch.ratio - 1.0) < 3.0 * branch.ratio_uncertainty < 0.1
+    assert abs(math.log(branch.time / 10.0)) < 3.0 * branch.time_relative
+    stiff = found.quantities["stiffness_fixed"]
+    assert abs(stiff.value - relaxed_stiffness(cone, found)) < 3.0 * stiff.uncertainty
+    assert found.spectrum.counts[-1].held_out < 2.0
+    (curve,) = relaxed
+    assert curve.flagged is not None and curve.flagged.any()
