@@ -12,7 +12,7 @@ enum {
     MOST_PARAMETERS = 8
 }; /* moduli, or shape parameters */
 enum {
-    MOST_STATIONS = 48
+    MOST_STATIONS = 72
 }; /* points that a law is asked for at once */
 
 enum {

@@ -1,10 +1,9 @@
 /* The membrane's equilibrium, many states after one another: the kernel of model/membrane/solve.py.
 
-   It treats taut films of one element that are on the branch from rest by a look at their energy, or by few steps of
-   the voltage, and wrinkled ones that the voltage does not soften; every other state is left to the methods for arrays
-   (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so that nothing depends on the
+   It treats films of one element by the plain equations, followed from rest where the voltage softens them, and by the
+   relaxed energy where it does not; every other state is left to the methods for arrays (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so that nothing depends on the
    others. */
-#include "connected.h"
+#include "from_rest.h"
 #include "tension_field.h"
 
 #ifdef _WIN32
@@ -82,7 +81,7 @@ static int is_slack(Problem *problem) {
     Stress law;
     if (problem->field == 0.0) return 0;
     stress_at(problem, log, log, &law);
-    return !(law.t1[0] >= 0.0);
+    return law.t1[0] < 0.0;
 }
 
 /* The answer in SI units. */
@@ -169,6 +168,47 @@ static int64_t wrinkled_answer(const Task *task, const Film *film, Problem *prob
     return placed;
 }
 
+/* A solved plain state on the branch from rest, placed. */
+static int64_t plain_answer(const Task *task, const Film *film, Problem *problem, double h, double voltage,
+                            const Extremes *x, const Iterate *found, const Grid *grid, const State *state,
+                            const Points *at, Answer *out, Kept *kept) {
+    int wrinkled = x->hoop < ROUND_OFF_TENSION * x->meridional;
+    int64_t placed = place_all(film, problem, h, voltage, x, found, grid->table->modes, wrinkled, out);
+    if (task->sensitivities) {
+        Reduced system;
+        Step by_height;
+        Derivatives d = {{0.0}, {0.0}, 0.0, 0.0, 0.0, 0.0};
+        reduce(grid, state->w, at, &system);
+        factor(grid->table->modes, system.coupling, system.give, system.matrix, system.diagonal);
+        tangent(grid, &system, &by_height);
+        d.height = by_height.lam;
+        add_derivatives(problem, grid, state->w, at, 0, found->lam, by_height.dc, by_height.dw, by_height.lam, &d);
+        place_slopes(film, h, voltage, &d, out);
+    }
+    if (kept) keep_plain(grid, state, kept);
+    return placed;
+}
+
+/* A state that a cold start misses, or may have found on another branch, after so many `steps`. */
+static int64_t followed_answer(const Task *task, const Film *film, Problem *problem, double h, double voltage,
+                               int slack, int64_t steps, Answer *out, Kept *kept) {
+    Grid grid;
+    State state;
+    Iterate found;
+    Points at;
+    Extremes x;
+    if (task->relaxed) return LEFT_TO_OTHERS;
+    int status = from_rest(problem, task->tables, task->tolerance, slack, &grid, &state, &found, &out->error_estimate);
+    found.steps += steps;
+    out->iterations = found.steps;
+    if (status != TAUT) return status;
+    evaluate(problem, &grid, &state, NULL, &at);
+    Solved solved = {1, &grid, &at, NULL};
+    extremes(problem, &solved, found.lam, &x);
+    if (!(x.meridional > 0.0)) return slack ? SLACK : LEFT_TO_OTHERS;
+    return plain_answer(task, film, problem, h, voltage, &x, &found, &grid, &state, &at, out, kept);
+}
+
 /* One state. Returns its status; `out` has numbers where that is TAUT or WRINKLED. */
 static int64_t answer(const Task *task, const Film *film, double h, double voltage, Answer *out, Kept *kept) {
     Problem problem;
@@ -179,36 +219,37 @@ static int64_t answer(const Task *task, const Film *film, double h, double volta
     Extremes x;
     if (!is_film(film) || !(fabs(h) < INFINITY) || !(fabs(voltage) < INFINITY)) return LEFT_TO_OTHERS;
     pose(film, h, voltage, &problem);
-    if (!(problem.span > 0.0 && problem.span <= LONGEST) || !is_positive(problem.height) || is_slack(&problem))
-        return LEFT_TO_OTHERS;
+    if (!(problem.span > 0.0 && problem.span <= LONGEST) || !is_positive(problem.height)) return LEFT_TO_OTHERS;
+    /* The plain equations may still have a state with compression around and tension along the film. */
+    int slack = is_slack(&problem);
+    out->iterations = 0;
+    if (slack && task->relaxed) return SLACK;
     int64_t first = task->first_modes[problem.span <= 2.4 ? 0 : problem.span <= 3.1 ? 1 : 2];
     int status = refine(&problem, task->tables, first, task->tolerance, task->relaxed != 0, &grid, &state, &found,
                         &out->error_estimate);
     if (status == FOLDED) return wrinkled_answer(task, film, &problem, h, voltage, &found, &grid, &state, out, kept);
+    if (status == UNSETTLED) return followed_answer(task, film, &problem, h, voltage, slack, found.steps, out, kept);
     if (status != TAUT) return status;
     evaluate(&problem, &grid, &state, NULL, &at);
     Solved solved = {1, &grid, &at, NULL};
     extremes(&problem, &solved, found.lam, &x);
-    int wrinkled = !(x.hoop >= ROUND_OFF_TENSION * x.meridional);
-    if (wrinkled && task->relaxed)
+    if (task->relaxed && !(x.hoop >= ROUND_OFF_TENSION * x.meridional))
         return wrinkled_answer(task, film, &problem, h, voltage, &found, &grid, &state, out, kept);
-    if (!(x.meridional > 0.0)) return LEFT_TO_OTHERS;
-    if (!(x.softening <= SOFTENING) && !connected(&problem, task->tables[CHECK_MODES], &grid, &state, found.lam))
-        return LEFT_TO_OTHERS;
-    int64_t placed = place_all(film, &problem, h, voltage, &x, &found, grid.table->modes, wrinkled, out);
-    if (task->sensitivities) {
-        Reduced system;
-        Step by_height;
-        Derivatives d = {{0.0}, {0.0}, 0.0, 0.0, 0.0, 0.0};
-        reduce(&grid, state.w, &at, &system);
-        factor(grid.table->modes, system.coupling, system.give, system.matrix, system.diagonal);
-        tangent(&grid, &system, &by_height);
-        d.height = by_height.lam;
-        add_derivatives(&problem, &grid, state.w, &at, 0, found.lam, by_height.dc, by_height.dw, by_height.lam, &d);
-        place_slopes(film, h, voltage, &d, out);
-    }
-    if (kept) keep_plain(&grid, &state, kept);
-    return placed;
+    int doubtful = !(x.meridional > 0.0) || !(x.softening <= SOFTENING);
+    if (doubtful && x.meridional > 0.0)
+        doubtful = !connected(&problem, task->tables[CHECK_MODES], &grid, &state, found.lam);
+    if (doubtful) return followed_answer(task, film, &problem, h, voltage, slack, found.steps, out, kept);
+    return plain_answer(task, film, &problem, h, voltage, &x, &found, &grid, &state, &at, out, kept);
+}
+
+/* A state without numbers. */
+static void leave_blank(Answer *out) {
+    out->force = out->peak_field = out->peak_field_radius = out->min_hoop_stress = NAN;
+    out->min_meridional_stress = out->max_stretch = out->error_estimate = out->lam = NAN;
+    out->modes = out->mechanical = out->electric = out->relaxed = 0;
+    Slopes *f = &out->dforce;
+    f->h = f->voltage = f->disk_radius = f->ring_radius = f->thickness = f->prestretch = f->eps_r = NAN;
+    for (int64_t k = 0; k < MOST_PARAMETERS; k++) f->mu[k] = f->alpha[k] = NAN;
 }
 
 static int is_task(const Task *task) {
@@ -234,9 +275,18 @@ EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t fil
         out->status = LEFT_TO_OTHERS;
         if (which[s] >= 0 && which[s] < film_count)
             out->status = answer(task, &films[which[s]], h[s], voltage[s], out, kept ? &kept[s] : NULL);
+        if (out->status > WRINKLED) leave_blank(out);
         if (out->status < 0) left++;
     }
     return left;
+}
+
+/* Whether no tension can hold the film: 1 or 0, or -1 where that is left to others. */
+EXPORT int64_t dea_kernel_hangs_slack(const Film *film, double h, double voltage) {
+    Problem problem;
+    if (!is_film(film) || !(fabs(h) < INFINITY) || !(fabs(voltage) < INFINITY)) return -1;
+    pose(film, h, voltage, &problem);
+    return is_slack(&problem);
 }
 
 /* exp, expm1, log, log1p of n numbers, for tests. */

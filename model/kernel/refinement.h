@@ -11,18 +11,22 @@ enum {
 #define NEWTON_FACTOR 0.3
 #define LEVEL_FACTOR 0.5
 #define ROUND_OFF 1e-13
-#define LEAST_SHARE 0.05
+#define LEAST_SHARE 0.15
 #define CLEARLY_NEGATIVE (-1e-2)
 #define ROUND_OFF_TENSION (-1e-9)
 #define LONGEST 4.0
 
-/* What a state came to; the first two are numbers of model.membrane.solution.Status. */
+/* What a state came to; those from 0 on are numbers of model.membrane.solution.Status. */
 enum {
     TAUT = 0,
     WRINKLED = 1,
+    SLACK = 2,
+    UNSTABLE = 3,
+    NOT_CONVERGED = 4,
     LEFT_TO_OTHERS = -1,
     NEEDS_TABLE = -2,
-    FOLDED = -3
+    FOLDED = -3,
+    UNSETTLED = -4
 };
 
 /* A state after Newton at one resolution. */
@@ -37,6 +41,7 @@ typedef struct {
 
 static double larger(double x, double y) { return x > y ? x : y; }
 static double smaller(double x, double y) { return x < y ? x : y; }
+static double clipped(double x, double most) { return smaller(larger(x, -most), most); }
 
 /* Change of a slope at which Newton's error is just below the tolerance. */
 static double goal(double tolerance) { return smaller(0.03, larger(1e-6, sqrt(0.9 * tolerance / NEWTON_FACTOR))); }
@@ -127,30 +132,36 @@ static void prolong(const Table *from, const Table *to, const double *matrix, St
         if (!(state->w[i] > 0.0)) state->w[i] = least;
 }
 
-/* The state to `tolerance`, at the resolution that it needs. `tables` has one for so many modes at that place, or none.
-   `relaxed`: a state whose hoop stress is clearly negative is FOLDED at once. */
-static int refine(Problem *problem, const Table *const *tables, int64_t modes, double tolerance, int relaxed,
-                  Grid *grid, State *state, Iterate *found, double *error) {
+/* The state of `grid` to `tolerance`, at the resolution that it needs. `tables` has one for so many modes at that place,
+   or none. `relaxed`: a state whose hoop stress is clearly negative is FOLDED at once. */
+static int settle_plain(Problem *problem, const Table *const *tables, double tolerance, int relaxed, Grid *grid,
+                        State *state, Iterate *found, double *error) {
     double aim = goal(tolerance), previous = NAN;
     int64_t steps = 0;
-    if (!tables[modes]) return NEEDS_TABLE;
-    lay(grid, tables[modes], modes, -problem->span, 0.0);
-    guess(problem, grid, state);
     for (;;) {
         *found = newton(problem, grid, state, aim, MOST_STEPS);
         steps += found->steps;
         found->steps = steps;
         if (relaxed && found->hoop <= CLEARLY_NEGATIVE) return FOLDED;
-        if (!found->ok) return LEFT_TO_OTHERS;
+        if (!found->ok) return UNSETTLED;
         *error = estimate(found, previous, tolerance, LEVEL_FACTOR);
         if (*error <= tolerance) return TAUT;
         previous = found->lam;
         const Table *now = grid->table;
-        if (now->next > MOST_MODES) return LEFT_TO_OTHERS;
+        if (now->next > MOST_MODES) return UNSETTLED;
         if (!tables[now->next]) return NEEDS_TABLE;
         prolong(now, tables[now->next], now->carry, state);
         lay(grid, tables[now->next], now->next, -problem->span, 0.0);
     }
+}
+
+/* The same from the first guess, with so many `modes` to begin with. */
+static int refine(Problem *problem, const Table *const *tables, int64_t modes, double tolerance, int relaxed,
+                  Grid *grid, State *state, Iterate *found, double *error) {
+    if (!tables[modes]) return NEEDS_TABLE;
+    lay(grid, tables[modes], modes, -problem->span, 0.0);
+    guess(problem, grid, state);
+    return settle_plain(problem, tables, tolerance, relaxed, grid, state, found, error);
 }
 
 #endif

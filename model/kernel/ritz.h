@@ -9,7 +9,7 @@
 #include "law.h"
 
 enum {
-    MOST_MODES = 36,
+    MOST_MODES = 64,
     MOST_POINTS = MOST_MODES + 3,
     MOST_ELEMENTS = 5,
     MOST_FUNCTIONS = MOST_MODES + 2, /* with the hats */

@@ -106,8 +106,6 @@ static void add_element(const Cut *cut, const Reduced *part, int64_t own, int64_
     if (!part->positive) system->positive = 0;
 }
 
-static double clipped(double x, double most) { return smaller(larger(x, -most), most); }
-
 /* The law at a cone's points, relaxed and linearised at the natural width. */
 static int folded_law(Problem *problem, int64_t n, const double *u, const double *natural, Stress *law, double *change,
                       double *follow) {

@@ -1,7 +1,7 @@
-"""The compiled kernel (`model/kernel/membrane.c`): taut states of one element, by the steps of `model.membrane.ritz`.
+"""The compiled kernel (`model/kernel/membrane.c`): states of one element, by the steps of `model.membrane.ritz`.
 
-What it leaves to others (wrinkled or doubtful states, films of a huge span, laws that exist in Python only) is solved
-by the methods for arrays, as everything is where there is no kernel.
+What it leaves to others (soft wrinkled states, films of a huge span, laws that exist in Python only) is solved by the
+methods for arrays, as everything is where there is no kernel.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from model.material.ogden import Ogden
 from model.material.yeoh import Yeoh
 from model.membrane import output, ritz
 from model.membrane.flat import Flat
-from model.membrane.from_rest import CHECK_MODES
+from model.membrane.from_rest import CHECK_MODES, TRACE_MODES
 from model.membrane.refinement import SPANS, first_modes, next_modes
 from model.specimen import Specimen
 
-MOST_MODES, MOST_ELEMENTS, MOST_PARAMETERS = 36, 5, 8
+MOST_MODES, MOST_ELEMENTS, MOST_PARAMETERS = 64, 5, 8
 MOST_POINTS = MOST_MODES + ritz.MORE_POINTS
 LAWS: tuple[type[Law], ...] = (Ogden, NeoHooke, MooneyRivlin, Yeoh, Gent)  # in the order of their numbers in law.h
 SLOPES = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
@@ -42,6 +42,8 @@ NUMBERS = (
 )
 NEEDS_TABLE = -2  # in place of a status, of which the negative ones are left to others
 FEW_LEVELS = 3  # resolutions whose tables are made at once; most states need two
+# Tables for so many modes: the first levels only, those that nearly all states can do with, all. The last are large.
+TIERS = (0, 36, MOST_MODES)
 
 
 class _Table(Structure):
@@ -141,7 +143,7 @@ class _Kept(Structure):
 @lru_cache(maxsize=MOST_MODES)
 def _table(modes: int) -> tuple[_Table, list[Array]]:
     """Tables of `model.membrane.ritz` as the kernel reads them, and the arrays that must outlive them."""
-    t, after = ritz.table(modes), next_modes(modes)
+    t, after = ritz.table(modes), next_modes(modes) if modes < MOST_MODES else MOST_MODES + 1
     functions = t.values.reshape(2, t.points, modes + 2)
     arrays = {
         "xi": t.xi,
@@ -157,7 +159,7 @@ def _table(modes: int) -> tuple[_Table, list[Array]]:
         "fine": output.fine_table(modes).T,
         "fine_xi": -np.cos(np.linspace(0.0, np.pi, output.FINE)),
         "legendre": t.to_legendre.T,
-        "carry": ritz.transfer(modes, after),
+        "carry": ritz.transfer(modes, min(after, MOST_MODES)),
         "check": ritz.transfer(modes, CHECK_MODES),
     }
     kept = {name: np.ascontiguousarray(values, dtype=np.float64) for name, values in arrays.items()}
@@ -166,15 +168,16 @@ def _table(modes: int) -> tuple[_Table, list[Array]]:
 
 
 @lru_cache(maxsize=64)
-def _task(tolerance: float, relaxed: bool, sensitivities: bool, whole: bool) -> _Task:
-    """What the states of a call share; tables of every resolution when ``whole``, else of the first ones."""
+def _task(tolerance: float, relaxed: bool, sensitivities: bool, most: int) -> _Task:
+    """What the states of a call share; tables of every resolution up to ``most`` modes, of the first ones when 0."""
     firsts = [first_modes(span, tolerance) for span in SPANS]
     task = _Task((), tuple(firsts), relaxed, sensitivities, tolerance)
-    for modes in {*firsts, *(max(3, modes) for modes in firsts), CHECK_MODES}:
+    begins = {*firsts, *(max(3, modes) for modes in firsts), CHECK_MODES}
+    for modes in begins | set(TRACE_MODES) if most else begins:
         level = 0
-        while modes <= MOST_MODES and (whole or level < FEW_LEVELS):
+        while modes <= (most or MOST_MODES) and (most or level < FEW_LEVELS):
             task.tables[modes] = ctypes.pointer(_table(modes)[0])
-            modes, level = next_modes(modes), level + 1
+            modes, level = _table(modes)[0].next, level + 1
     return task
 
 
@@ -222,6 +225,11 @@ class One:
     def lam(self) -> float:
         return float(self.answer.lam)
 
+    @property
+    def answered(self) -> bool:
+        """Whether there is a force."""
+        return int(self.answer.status) <= 1
+
     def arrays(self) -> tuple[ritz.Grid, ritz.State]:
         """The state as the rest of the model has it."""
         kept, n, m = self.kept, self.answer.modes, self.kept.elements
@@ -239,7 +247,7 @@ class One:
         """Attributes of `model.membrane.solve.Solution`."""
         found = self.answer
         values: dict[str, Any] = {name: getattr(found, name) for name in NUMBERS}
-        values["stable"] = True
+        values["stable"] = self.answered
         values["field_exceeded"] = found.peak_field > (material.breakdown_field or math.inf)
         values["stretch_exceeded"] = found.max_stretch > (material.max_stretch or math.inf)
         values["evaluations"] = Evaluations(found.mechanical, found.electric, found.relaxed)
@@ -264,13 +272,38 @@ def solve_one(
     if solver is None:
         return None
     film, answer, kept = _one_film(specimen), _Answer(), _Kept()
-    for whole in (False, True):
-        task = _task(tolerance, relaxed, sensitivities, whole)
+    for most in TIERS:
+        task = _task(tolerance, relaxed, sensitivities, most)
         where = byref(c_double(h)), byref(c_double(voltage))
         solver(byref(task), byref(film), 1, byref(_FIRST), 1, *where, byref(answer), byref(kept))
         if answer.status != NEEDS_TABLE:
             break
     return One(answer, kept) if answer.status >= 0 else None
+
+
+def hangs_slack(specimen: Specimen, h: float, voltage: float) -> bool | None:
+    """Whether no tension can hold the film; None where that is left to others."""
+    solver = _solver()
+    if solver is None:
+        return None
+    found = _slack()(byref(_one_film(specimen)), h, voltage)
+    return None if found < 0 else bool(found)
+
+
+def warm() -> None:
+    """Make what a first state that is followed from rest needs at `solve`'s own tolerance: it takes some 50 ms."""
+    if _solver() is not None:
+        _task(1e-8, False, False, TIERS[1])
+
+
+@lru_cache(maxsize=1)
+def _slack() -> Any:
+    library = load()
+    assert library is not None
+    function = library.dea_kernel_hangs_slack
+    function.restype = c_int64
+    function.argtypes = [c_void_p, c_double, c_double]
+    return function
 
 
 _one_film = lru_cache(maxsize=16)(_film)
@@ -295,11 +328,11 @@ def solve_states(
     if solver is None:
         return left
     films = (_Film * len(specimens))(*(_film(specimen) for specimen in specimens))
-    for whole in (False, True):
+    for most in TIERS:
         some = np.flatnonzero(left)
         of, hh, vv = which[some].astype(np.int64), h[some].astype(np.float64), voltage[some].astype(np.float64)
         found = np.zeros(len(some), dtype=_RECORD)
-        task = _task(tolerance, relaxed, result.dforce is not None, whole)
+        task = _task(tolerance, relaxed, result.dforce is not None, most)
         data = [array.ctypes.data for array in (of, hh, vv, found)]
         solver(byref(task), films, len(films), data[0], len(some), *data[1:], None)
         good = found["status"] >= 0
@@ -323,7 +356,7 @@ def _place(
         for name, array in values.items():
             array[to] = found[name]
     result.status[to] = found["status"]
-    result.flag["stable"][to] = True
+    result.flag["stable"][to] = found["status"] <= 1
     materials = [specimen.material for specimen in specimens]
     of = which[to]
     for name, quantity, limits in (

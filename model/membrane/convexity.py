@@ -70,7 +70,7 @@ def stations(problem: Problem, grid: Grid, state: State, lam: Array) -> Stations
 
 def margin(problem: Problem, found: Stations) -> Array:
     """Least stiffness along the films, (S,), as a share of what it is without Maxwell stress: positive where convex."""
-    return _least(found.log1, stiffness(problem, found))
+    return _least(found.log1, *stiffness(problem, found))
 
 
 SHARES = (0.0, 0.5, 1.0)  # of the radial displacement
@@ -103,8 +103,8 @@ def between(problem: Problem, grid: Grid, state: State) -> NDArray[np.bool_]:
     return np.asarray(good & (low < high))
 
 
-def stiffness(problem: Problem, found: Stations) -> Array:
-    """``d2W*/dl1^2``, relaxed where the film wrinkles, as a share of that without Maxwell stress; -1 without a law."""
+def stiffness(problem: Problem, found: Stations) -> tuple[Array, NDArray[np.bool_]]:
+    """``d2W*/dl1^2`` as a share of that without Maxwell stress, -1 without a law; and where the film is wrinkled."""
     law = stress(problem.film, stack(found.log1, found.hoop))
     wrinkled = (law.t2 < 0.0) & found.relaxed
     if wrinkled.any():
@@ -115,27 +115,32 @@ def stiffness(problem: Problem, found: Stations) -> Array:
         law = stress(problem.film, stack(found.log1, log2))
     bare = np.abs(law.h11 - law.t1 + (0.0 if law.maxwell is None else law.maxwell))
     if not wrinkled.any():
-        return (law.h11 - law.t1) / bare
+        return (law.h11 - law.t1) / bare, wrinkled
     loose = relax(problem.film, law, wrinkled)
     rise = (loose.h11 - loose.t1) / bare
     # Without a natural width to settle at there is no relaxed law.
-    return np.where(wrinkled & ~(law.h22 > 0.0), -1.0, rise)
+    return np.where(wrinkled & ~(law.h22 > 0.0), -1.0, rise), wrinkled
 
 
-def _least(place: Array, values: Array) -> Array:
-    """Least of ``values`` (P, S) along ``place``, of the parabola through the least and its neighbours; NaN is none."""
+def _least(place: Array, values: Array, wrinkled: NDArray[np.bool_]) -> Array:
+    """Least of ``values`` (P, S) along ``place``, of the parabola through the least and its neighbours; NaN is none.
+
+    At the edge of a wrinkled zone the values jump: no parabola leads over it.
+    """
     values = np.where(np.isfinite(values), values, -1.0)
     last, columns = len(values) - 1, np.arange(values.shape[1])
     lowest = values.argmin(axis=0)
     middle = np.clip(lowest, 1, last - 1)
     x0, x1, x2 = (place[middle + k, columns] for k in (-1, 0, 1))
     y0, y1, y2 = (values[middle + k, columns] for k in (-1, 0, 1))
+    kinds = [wrinkled[middle + k, columns] for k in (-1, 0, 1)]
     with np.errstate(all="ignore"):
         d01, d12 = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
         curve = (d12 - d01) / (x2 - x0)
         slope = d01 + curve * (x1 - x0)
         dip = y1 - 0.25 * slope * slope / curve
         inside = (lowest == middle) & (curve > 0.0) & np.isfinite(dip)
+        inside &= (kinds[0] == kinds[1]) & (kinds[2] == kinds[1])
     # The parabola dips below its points by no more than they differ.
     bound = y1 - 0.5 * np.maximum(np.abs(y0 - y1), np.abs(y2 - y1))
     least: Array = values[lowest, columns]

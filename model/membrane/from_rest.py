@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Array
-from model.membrane import continuation, convexity, refinement, tension_field
+from model.membrane import continuation, convexity, refinement, ritz, tension_field
 from model.membrane.refinement import Answer, Start, refine
 from model.membrane.ritz import Problem, State, guess
 
-TRACE_MODES = 10
-CLOSE = 2e-3  # of V^2: a path that ended so close below the wanted voltage is followed again, with cuts
+TRACE_MODES = (10, 16, 24)  # of a path; more where it ends without telling why, or at a state that does not settle
+PIECES = 4  # elements in place of one where one does not settle
+CLOSE = 2e-3  # of V^2: a path that ended so close below the wanted voltage is followed again
 BACK = (0.03, 0.3)  # of V^2: where that begins
 STEP = 1e-5  # of V^2: its smallest step
 SOFT = 0.1  # stiffness below which a path that ends has met the loss of convexity
@@ -34,40 +35,98 @@ class Ended:
         self.steps = np.zeros(states, dtype=np.intp)
 
 
-def solve(problem: Problem, tolerance: float, *, relaxed: bool, sensitivities: bool) -> tuple[list[Answer], Ended]:
-    """Answers to the states that are on the branch from rest; for the others whether the branch ends before."""
+def solve(
+    problem: Problem, tolerance: float, slack: NDArray[np.bool_], *, relaxed: bool, sensitivities: bool
+) -> tuple[list[Answer], Ended]:
+    """Answers to the states that are on the branch from rest; for the others whether the branch ends before.
+
+    Those that hang ``slack`` are not sought for long.
+    """
     states = len(problem.span)
-    path = continuation.follow(problem, TRACE_MODES, relaxed=relaxed)
     ended = Ended(states)
-    ended.steps += path.steps
-    ended.unstable |= path.limit
     answers: list[Answer] = []
-    done = np.zeros(states, dtype=np.bool_)
-    good = np.flatnonzero(path.reached)
-    if len(good):
-        found, spent = settled(
-            problem.take(good), tolerance, Start(path.grid.take(good), path.state.take(good)), relaxed, sensitivities
-        )
-        ended.steps[good] += spent
-        for answer in found:
-            answer.index = good[answer.index]
-            answer = _convex(problem, answer)
-            done[answer.index] = True
-            answers.append(answer)
+    progress = np.zeros(states)
+    rest, reached = np.arange(states), np.arange(0)
     end = 1.0 if problem.film.field is None else 2.0
-    for state in np.flatnonzero(~done & (path.progress > end - 1.0) & (path.progress > end - CLOSE)).tolist():
+    for modes in TRACE_MODES:
+        path = continuation.follow(problem.take(rest), modes, relaxed=relaxed)
+        ended.steps[rest] += path.steps
+        ended.unstable[rest] |= path.limit
+        progress[rest] = path.progress
+        good = np.flatnonzero(path.reached)
+        begin = Start(path.grid.take(good), path.state.take(good))
+        reached = rest[good]
+        found, lost = settled(problem, reached, tolerance, begin, relaxed, sensitivities, ended)
+        answers += found
+        left = np.zeros(states, dtype=np.bool_)
+        near = (path.progress > end - 1.0) & (path.progress > end - CLOSE) & (not relaxed)
+        left[rest[~path.reached & (near | ~path.limit)]] = left[reached[lost]] = True
+        left &= ~slack
+        lost = lost[left[reached[lost]]]
+        reached, begin, rest = reached[lost], begin.take(lost), np.flatnonzero(left)
+        if len(rest) == 0:
+            break
+    if len(reached) and not relaxed:
+        found, _ = settled(
+            problem, reached, tolerance, _in_pieces(problem.take(reached), begin), False, sensitivities, ended
+        )
+        answers += found
+    done = np.zeros(states, dtype=np.bool_) if relaxed else np.ones(states, dtype=np.bool_)
+    for answer in answers:
+        done[answer.index] = True
+    for state in np.flatnonzero(~done & (progress > end - 1.0) & (progress > end - CLOSE)).tolist():
         one = np.array([state])
         last = Approach(problem.take(one), end, relaxed).run()
         ended.steps[one] += last.steps
         ended.unstable[one] |= last.limit
-        if not last.reached:
-            continue
-        found, spent = settled(problem.take(one), tolerance, last.begin, relaxed, sensitivities)
-        ended.steps[one] += spent
-        for answer in found:
-            answer.index = one[answer.index]
-            answers.append(_convex(problem, answer))
+        if last.reached:
+            answers += settled(problem, one, tolerance, last.begin, relaxed, sensitivities, ended)[0]
     return answers, ended
+
+
+def settled(
+    problem: Problem,
+    these: NDArray[np.intp],
+    tolerance: float,
+    begin: Start,
+    relaxed: bool,
+    sensitivities: bool,
+    ended: Ended,
+) -> tuple[list[Answer], NDArray[np.intp]]:
+    """The states ``these`` to their tolerance from ``begin``, and which of them do not settle, by their place there.
+
+    One whose law is not convex along the film is beyond the end of the branch.
+    """
+    if len(these) == 0:
+        return [], these
+    answers, lost, spent = _settled(problem.take(these), tolerance, begin, relaxed, sensitivities)
+    ended.steps[these] += spent
+    answers = [answer for answer in answers if len(answer.index)]
+    for answer in answers:
+        answer.index = these[answer.index]
+    if problem.film.field is not None:
+        good = [_margin(problem.take(answer.index), answer) > 0.0 for answer in answers]
+        for answer, convex in zip(answers, good, strict=True):
+            ended.unstable[answer.index[~convex]] = True
+        answers = [answer.take(convex) for answer, convex in zip(answers, good, strict=True)]
+    return answers, lost
+
+
+def _settled(
+    problem: Problem, tolerance: float, begin: Start, relaxed: bool, sensitivities: bool = False
+) -> tuple[list[Answer], NDArray[np.intp], NDArray[np.intp]]:
+    if relaxed:
+        return tension_field.solve(problem, tolerance, sensitivities=sensitivities, begin=begin, careful=True)
+    return refine(problem, tolerance, begin, sensitivities=sensitivities)
+
+
+def _in_pieces(problem: Problem, begin: Start) -> Start:
+    """Plain states with short elements: those that would wrinkle have layers, for which more modes help little."""
+    pieces = PIECES * begin.grid.elements
+    at = ritz.evaluate(problem, begin.grid, begin.state)
+    taut = np.zeros(pieces, dtype=np.bool_)
+    cut = tension_field.remap(begin.grid, begin.state, at.log[1], problem.cut(pieces), begin.grid.table.modes, taut)
+    return Start(cut.grid, State(cut.state.c, cut.state.w))
 
 
 def connected(problem: Problem, end: Start, lam: Array) -> NDArray[np.bool_]:
@@ -114,26 +173,6 @@ def _led(problem: Problem, end: Start, begun: State, steps: int) -> NDArray[np.b
     return np.asarray(good & (np.abs(ahead / end.state.w - 1.0).max(axis=(0, 1)) < continuation.CORRECTION))
 
 
-def settled(
-    problem: Problem, tolerance: float, begin: Start, relaxed: bool, sensitivities: bool = False
-) -> tuple[list[Answer], NDArray[np.intp]]:
-    """The states to their tolerance from ``begin``."""
-    if relaxed:
-        answers, _, spent = tension_field.solve(
-            problem, tolerance, sensitivities=sensitivities, begin=begin, careful=True
-        )
-    else:
-        answers, _, spent = refine(problem, tolerance, begin, sensitivities=sensitivities)
-    return answers, spent
-
-
-def _convex(problem: Problem, answer: Answer) -> Answer:
-    """The answers whose law is convex along the film."""
-    if problem.film.field is None or len(answer.index) == 0:
-        return answer
-    return answer.take(_margin(problem.take(answer.index), answer) > 0.0)
-
-
 def _margin(problem: Problem, answer: Answer) -> Array:
     return convexity.margin(problem, convexity.stations(problem, answer.grid, answer.state, answer.lam))
 
@@ -153,7 +192,7 @@ class Approach:
         for back in BACK:
             self.progress = self.end - back
             part = continuation.at(self.problem, one, np.array([self.progress]))
-            path = continuation.follow(part, TRACE_MODES, relaxed=self.relaxed)
+            path = continuation.follow(part, TRACE_MODES[0], relaxed=self.relaxed)
             self.steps += int(path.steps[0])
             if path.reached[0] and self._step(part, Start(path.grid, path.state)):
                 break
@@ -175,7 +214,7 @@ class Approach:
         return self
 
     def _step(self, part: Problem, begin: Start) -> bool:
-        answers, steps = settled(part, ROUGH, begin, self.relaxed)
+        answers, _, steps = _settled(part, ROUGH, begin, self.relaxed)
         self.steps += int(steps[0])
         for answer in answers:
             if len(answer.index) and (margin := float(_margin(part, answer)[0])) > 0.0:

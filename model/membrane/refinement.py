@@ -32,7 +32,7 @@ ROUND_OFF = 1e-13
 CLEARLY_NEGATIVE = -1e-2
 ROUND_OFF_TENSION = -1e-9
 MANY = 50  # states from which on those that have settled are worth leaving behind
-LEAST_SHARE = 0.05  # of the tolerance: below it no estimate is claimed, two resolutions may agree by chance
+LEAST_SHARE = 0.15  # of the tolerance: below it no estimate is claimed, two resolutions may agree by chance
 
 
 @dataclass(slots=True)

@@ -97,7 +97,7 @@ class Solution:
 
     def _solved(self, inputs: _Inputs) -> Solved:
         """The state itself, in arrays. Raises ValueError when it has no answer."""
-        if self.quick is not None:
+        if self.quick is not None and self.answered:
             problem = _Block(inputs, np.zeros(1, dtype=np.intp), self.evaluations).problem
             return problem, *self.quick.arrays(), np.array([self.quick.lam])
         if self.kept is None:
@@ -319,6 +319,9 @@ def hangs_slack(specimen: Specimen, h: float, voltage: float) -> bool:
     """
     if not (math.isfinite(h) and math.isfinite(voltage)) or voltage == 0.0:
         return False
+    found = compiled.hangs_slack(specimen, h, voltage)
+    if found is not None:
+        return found
     return bool(_Block(_Inputs.gather(specimen, h, voltage), np.zeros(1, np.intp), Evaluations()).slack()[0])
 
 
@@ -468,11 +471,14 @@ class _Block:
         sensitivities: bool,
     ) -> None:
         """Solve states for which a cold start may have missed, or jumped from, the branch that starts at rest."""
-        answers, ended = from_rest.solve(problem.take(some), tolerance, relaxed=relaxed, sensitivities=sensitivities)
-        steps[some] += ended.steps
         to = self.index[index[some]]
+        slack = result.status[to] == Status.SLACK
+        answers, ended = from_rest.solve(
+            problem.take(some), tolerance, slack, relaxed=relaxed, sensitivities=sensitivities
+        )
+        steps[some] += ended.steps
         failed = np.where(ended.unstable, Status.UNSTABLE, Status.NOT_CONVERGED)
-        result.status[to] = np.where(result.status[to] == Status.SLACK, Status.SLACK, failed)
+        result.status[to] = np.where(slack, Status.SLACK, failed)
         for answer in answers:
             answer.index = some[answer.index]
             self.place(result, index, answer, answer.extremes.meridional > 0.0)

@@ -34,6 +34,7 @@ SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a
 STEPS, CAREFUL_STEPS = 15, 40  # most of a rung
 CALM = 1e-4  # change of the strains from which a careful solution moves its cuts
 CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
+CAREFUL_WEIGHT = 1.0  # where the folds have hardly any stiffness left: the force feels it that much more
 
 
 def guess(problem: Problem, grid: Grid) -> State:
@@ -213,7 +214,7 @@ def _settle(
         breaks, shift = _moved(grid, panels, taut, cones.which, tension)
         if careful:
             breaks = np.where(change <= CALM, breaks, grid.breaks)
-        change = np.maximum(change, CUT_WEIGHT * shift)
+        change = np.maximum(change, (CAREFUL_WEIGHT if careful else CUT_WEIGHT) * shift)
         done = change <= goal
         # Where it has settled the state belongs to the cuts as they were.
         grid = Grid.lay(grid.table.modes, np.where(done, grid.breaks, breaks))

@@ -20,11 +20,14 @@ from model.material.yeoh import Yeoh
 from model.membrane import compiled
 from model.membrane.solve import Solutions, Status, solve, solve_many
 from model.specimen import Specimen
+from model.verification.search import draw
 
 pytestmark = pytest.mark.skipif(load() is None, reason=says())
 
 NUMBERS = compiled.NUMBERS[:6]
 FILM = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
+# Low exponents pull in before they lose tension.
+SOFT = Specimen(4e-3, 20e-3, 100e-6, 3.0, Material("soft", (1e5,), (1.3,), 3.0))
 
 
 @contextmanager
@@ -89,7 +92,8 @@ def test_the_kernel_has_the_digits_of_the_path_for_arrays(wrinkling: str, tolera
     films, h, voltage = random_films(60, seed=11)
     h[::3] *= -1.0
     state = {"tolerance": tolerance, "relaxed": wrinkling == "tension_field", "sensitivities": False}
-    known = [i for i in range(60) if compiled.solve_one(films[i], h[i], voltage[i], **state) is not None]
+    found = [compiled.solve_one(films[i], h[i], voltage[i], **state) for i in range(60)]
+    known = [i for i, one in enumerate(found) if one is not None and one.answered]
     assert len(known) > 30
     some = [films[i] for i in known]
     mine, theirs = both(some, h[known], voltage[known], tolerance=tolerance, wrinkling=wrinkling, sensitivities=True)
@@ -109,6 +113,27 @@ def test_the_kernel_has_the_digits_of_the_path_for_arrays(wrinkling: str, tolera
             mine.dforce[name] / size, slopes / size, rtol=1e-9, atol=1e-9, err_msg=name, equal_nan=True
         )
     assert 0 < mine.evaluations.electric < mine.evaluations.mechanical <= theirs.evaluations.mechanical
+
+
+def test_states_followed_from_rest_have_the_status_and_digits_of_the_path_for_arrays() -> None:
+    """Soft, deeply wrinkled and slack states, and the last ones before and the first ones beyond pull-in."""
+    states = draw(40, seed=104)
+    films, voltage = [*states.films, SOFT, SOFT, SOFT], np.append(states.voltage, [330.0, 339.0, 345.0])
+    h = np.append(states.h, [10e-3, 10e-3, 10e-3])
+    mine, theirs = both(films, h, voltage, tolerance=1e-6)
+    left = [
+        compiled.solve_one(film, *state, tolerance=1e-6, relaxed=False, sensitivities=False) is None
+        for film, *state in zip(films, h.tolist(), voltage.tolist(), strict=True)
+    ]
+    assert sum(left) <= 1
+    np.testing.assert_array_equal(mine.status, theirs.status)
+    for status in (Status.TAUT, Status.WRINKLED, Status.UNSTABLE, Status.SLACK):
+        assert np.any(mine.status == status), status.name
+    np.testing.assert_array_equal(mine.modes, theirs.modes)
+    np.testing.assert_array_equal(mine.stable, theirs.stable)
+    for name in (*NUMBERS, "error_estimate"):
+        np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), rtol=1e-6, err_msg=name)
+    np.testing.assert_allclose(mine.force, theirs.force, rtol=1e-11)
 
 
 LAWS = {
@@ -227,7 +252,7 @@ def test_hostile_numbers_get_a_status_and_crash_nothing() -> None:
     """Any bits as a film, a state, a number of terms, an index; a task that makes no sense is refused."""
     random = np.random.default_rng(3)
     solver = compiled._solver()
-    task = compiled._task(1e-8, True, True, True)
+    task = compiled._task(1e-8, True, True, compiled.MOST_MODES)
     film, answers, state = compiled._film(FILM), (compiled._Answer * 1)(), compiled._Kept()
     taut = 0
     for _ in range(3000):

@@ -72,7 +72,7 @@ def run(path: str) -> int:
         for values in (h, voltage):
             values[random.integers(0, states, states // 20)] = random.choice([0.0, np.nan, np.inf, 1e300, 5e-324])
         answers, kept = np.zeros(states, dtype=np.dtype(compiled._Answer)), (compiled._Kept * states)()
-        task = compiled._task(tolerance, bool(tolerance < 1e-6), True, True)
+        task = compiled._task(tolerance, bool(tolerance < 1e-6), True, compiled.MOST_MODES)
         pointers = [array.ctypes.data for array in (h, voltage, answers)]
         films = np.ascontiguousarray(films)
         solver(ctypes.byref(task), films.ctypes.data, len(films), which.ctypes.data, states, *pointers, kept)
