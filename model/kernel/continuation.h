@@ -1,5 +1,5 @@
-/* Following a state from rest, first h at 0 V, then V at h: model/membrane/continuation.py for the plain equations and a
-   film of one element. */
+/* Following a state from rest, first h at 0 V, then V at h: model/membrane/continuation.py for the plain equations and
+   a film of one element. */
 #ifndef DEA_CONTINUATION_H
 #define DEA_CONTINUATION_H
 
@@ -10,10 +10,10 @@ enum {
     POWER_STEPS = 100, /* of the inverse iteration */
     GUESS_ROUNDS = 40
 };
-#define LEAST_STEP 1e-5  /* of the leg; a path that cannot be followed in such steps has ended */
+#define LEAST_STEP 1e-5   /* of the leg; a path that cannot be followed in such steps has ended */
 #define FIRST_HEIGHT 0.02 /* share of h where the path begins */
-#define CORRECTION 0.3   /* largest relative change of a slope by the corrector: more would be a jump */
-#define SOFT 0.1         /* a path that ends with its lowest eigenvalue below this share of the first has met a limit */
+#define CORRECTION 0.3    /* largest relative change of a slope by the corrector: more would be a jump */
+#define SOFT 0.1          /* share of the first lowest eigenvalue below which a path that ends has met a limit point */
 
 /* The end of a path. */
 typedef struct {
@@ -183,7 +183,8 @@ static void follow(Problem *problem, const Table *table, Trace *out) {
         double aim = smaller(out->progress + size, out->progress < 1.0 ? 1.0 : 2.0);
         double run = out->progress - before_progress, ratio = run > 0.0 ? (aim - out->progress) / run : 0.0;
         go_to(problem, height, field, aim);
-        int good = path_step(problem, &out->grid, here, &before, ratio, aim > 1.0, &out->steps, &found, &jumped, &least);
+        int good =
+            path_step(problem, &out->grid, here, &before, ratio, aim > 1.0, &out->steps, &found, &jumped, &least);
         if (good) {
             before = *here;
             *here = found;

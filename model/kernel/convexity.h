@@ -92,8 +92,8 @@ static void half_way(const Stations *one, const Stations *two, Stations *out) {
     }
 }
 
-/* Least stiffness d2W-star/dl1^2 along the film, as a share of what it is without Maxwell stress: positive where the law
-   is convex. */
+/* Least stiffness d2W-star/dl1^2 along the film, as a share of what it is without Maxwell stress: positive where the
+   law is convex. */
 static double margin(Problem *problem, const Stations *found) {
     double log[3 * MOST_STATIONS], rise[MOST_WAY];
     Stress law;

@@ -58,8 +58,8 @@ static int connected(Problem *problem, const Table *check, const Grid *of, const
     return margin(problem, &way) > 0.0;
 }
 
-/* Follow the state from rest and bring it to its tolerance; a `slack` one is not sought for long. Returns TAUT with the state in `grid`, `state`, `found` and
-   `error`; or what it is. `found->steps` has the steps of all. */
+/* Follow the state from rest and bring it to its tolerance; a `slack` one is not sought for long. Returns TAUT with the
+   state in `grid`, `state`, `found` and `error`; or what it is. `found->steps` has the steps of all. */
 static int from_rest(Problem *problem, const Table *const *tables, double tolerance, int slack, Grid *grid,
                      State *state, Iterate *found, double *error) {
     double end = problem->field != 0.0 ? 2.0 : 1.0;

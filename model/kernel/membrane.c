@@ -1,8 +1,8 @@
 /* The membrane's equilibrium, many states after one another: the kernel of model/membrane/solve.py.
 
    It treats films of one element by the plain equations, followed from rest where the voltage softens them, and by the
-   relaxed energy where it does not; every other state is left to the methods for arrays (LEFT_TO_OTHERS). Each state is solved by itself with memory of its own on the stack, so that nothing depends on the
-   others. */
+   relaxed energy where it does not; every other state is left to the methods for arrays (LEFT_TO_OTHERS). Each state is
+   solved by itself with memory of its own on the stack, so that nothing depends on the others. */
 #include "from_rest.h"
 #include "tension_field.h"
 

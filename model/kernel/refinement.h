@@ -132,8 +132,8 @@ static void prolong(const Table *from, const Table *to, const double *matrix, St
         if (!(state->w[i] > 0.0)) state->w[i] = least;
 }
 
-/* The state of `grid` to `tolerance`, at the resolution that it needs. `tables` has one for so many modes at that place,
-   or none. `relaxed`: a state whose hoop stress is clearly negative is FOLDED at once. */
+/* The state of `grid` to `tolerance`, at the resolution that it needs. `tables` has one for so many modes at that
+   place, or none. `relaxed`: a state whose hoop stress is clearly negative is FOLDED at once. */
 static int settle_plain(Problem *problem, const Table *const *tables, double tolerance, int relaxed, Grid *grid,
                         State *state, Iterate *found, double *error) {
     double aim = goal(tolerance), previous = NAN;

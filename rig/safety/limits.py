@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from model.membrane.compiled import warm
 from model.membrane.solve import Solution, Status, hangs_slack, solve, solve_many
 from model.specimen import Specimen
 from rig.base.errors import LimitError
@@ -140,6 +141,7 @@ class FilmLimits:
         # What is loaded or tabulated on first use takes a tenth of a second: now, and not between two turns of a loop.
         hangs_slack(specimen, FLAT_M, 1.0)
         solve(specimen, FLAT_M, 1.0)
+        warm()
 
     def check(self, h: float, voltage: float, where: str) -> None:
         """Raise unless the film at ``h`` metres and ``voltage`` volts is taut and within its limits.

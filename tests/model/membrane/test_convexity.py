@@ -7,6 +7,7 @@ from itertools import groupby, pairwise
 import numpy as np
 import pytest
 
+from model.material.gent import Gent
 from model.material.materials import NAMED, Material
 from model.membrane.solve import Status, solve, solve_many
 from model.specimen import Specimen
@@ -93,11 +94,16 @@ def test_nothing_is_answered_beyond_the_end_of_the_branch(
 
 
 # One cone from disk to ring, where two resolutions may agree by chance; and a soft film whose cut stood too far off.
+# The last two are one taut film and one with a zone, of which two resolutions agreed by chance.
 CONES = [
     ((0.0012054977978506354, 9.180462869683009e-05, 1.8100168076447036), (39978.21946418071, 4.044769341731701),
      (3.250610344511693, 13.610365147187853), 0.015282737235284215, 2742.8402356381657),
     ((0.006130649035947979, 8.415586808868475e-05, 2.185941430063424), (34129.7959109893,),
      (3.7344277942008333,), 0.014486088377418079, 2163.11987641582),
+    ((0.0021989125143208076, 6.781589893605347e-05, 2.085317500001251), (51932.89140572999,),
+     (1.789813742132428,), 0.0019138087501209598, 946.7605522280443),
+    ((0.0024524525549298897, 1.116524672339377e-05, 1.988070250997784), (31771.914439505195, 109.65313210981235),
+     (2.06232521828303, 13.518331402885813), 0.007801455103719507, 599.4025310294924),
 ]  # fmt: skip
 
 
@@ -112,6 +118,41 @@ def test_forces_at_three_tolerances_agree_within_what_they_state(
         for one in found[:2]:
             off = abs(float(one.force / found[2].force) - 1.0)
             assert off <= float(one.error_estimate + found[2].error_estimate)
+
+
+# Plain states whose folds would be narrow: a coarse path ends elsewhere, or leads beyond the end of the branch, which
+# finite elements put at 0.892 and 0.9953 of these voltages, and a path by arc length at 0.9032 and 0.9955.
+NARROW = [
+    (Specimen(0.0011381801274735225, 0.02, 3.239765965589568e-05, 1.832555713779216,
+              Material("gent", (34000.41330776372,), (33.7022454043573,), 3.0, law=Gent)),
+     0.010765115144026132, 600.5630577564228, 0.85, 0.905),
+    (Specimen(0.0012216328217614031, 0.02, 3.123252206135942e-05, 1.7957123275996947,
+              Material("four", (40612.01118328048, 3.265505815686074, 7.514450088127211, 130.58223351214053),
+                       (3.038784712010136, 11.412884817239597, 9.96639062554887, 5.9849122979849385), 3.0)),
+     0.006794967767594611, 905.6430184799761, 0.99, 0.9965),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("film", "h", "voltage", "before", "beyond"), NARROW)
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-8])
+def test_beyond_the_end_of_a_plain_branch_every_state_is_unstable(
+    film: Specimen, h: float, voltage: float, before: float, beyond: float, tolerance: float
+) -> None:
+    shares = np.array([before, beyond, beyond + 0.004, 1.0])
+    found = solve_many(film, h, voltage * shares, tolerance=tolerance)
+    assert runs(found.status) == ["WRINKLED", "UNSTABLE"]
+    assert found.answered.sum() == 1
+
+
+def test_the_edge_of_a_wrinkled_zone_is_no_loss_of_convexity_and_its_place_is_in_the_stated_error() -> None:
+    """There the stiffness jumps from 0.08 to 0.88, and a cut that stood 1e-4 off erred by 1e-8 of the force."""
+    gent = Material("gent", (50672.300100066874,), (45.724719395253445,), 3.0, law=Gent)
+    film = Specimen(0.001353911976017867, 0.02, 5.108230813636204e-05, 1.3816623147432765, gent)
+    state = film, 0.02118595399296025, 725.6747638432524
+    found = [solve(*state, tolerance=t, wrinkling="tension_field") for t in (1e-4, 1e-6, 1e-8, 1e-10)]
+    assert [one.status for one in found] == [Status.WRINKLED] * 4
+    for one in found[:3]:
+        assert abs(one.force / found[3].force - 1.0) <= one.error_estimate + found[3].error_estimate
 
 
 @pytest.mark.slow
