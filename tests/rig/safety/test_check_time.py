@@ -62,7 +62,7 @@ def test_hostile_films_around_the_end_of_their_branches_are_answered_by_the_kern
     ],
 )
 def test_the_time_of_a_check(count: int) -> None:
-    """Never above 2 ms of processor that come back; on a quiet machine 99.9 % within 0.3 ms, which the long form asks."""
+    """Never above 2 ms of processor that come back; of a quiet machine the long form asks 0.3 ms for 99.9 %."""
     for name, volts in MET:
         scene, _ = load_scene(SCENES / name)
         guarded = FilmLimits(scene.specimen.specimen(), Limits.of(scene))
