@@ -76,7 +76,7 @@ def run(path: str) -> int:
         pointers = [array.ctypes.data for array in (h, voltage, answers)]
         films = np.ascontiguousarray(films)
         solver(ctypes.byref(task), films.ctypes.data, len(films), which.ctypes.data, states, *pointers, kept)
-        good = answers["status"] >= 0
+        good = (answers["status"] >= 0) & (answers["status"] <= 1)
         assert np.isfinite(answers["force"][good]).all()
         assert (answers["error_estimate"][good] <= tolerance).all()
         answered += int(good.sum())
