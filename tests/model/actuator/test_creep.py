@@ -33,6 +33,7 @@ EVERY = [MASS, SPRING, Bistable(10e-3, 0.15, 60.0, 1.5e6), Antagonist(film([]), 
 EVERY.append(Tabulated(tuple(np.linspace(0, 15e-3, 16)), tuple(0.8 - 50 * np.linspace(0, 15e-3, 16))))
 
 
+@pytest.mark.slow
 def test_at_once_and_in_the_end_it_is_where_films_are_that_take_no_time() -> None:
     specimen = film(TWO)
     many = creep_many([Actuator(specimen, bias) for bias in EVERY], [(*HOLD, STEP, 1.0)] * len(EVERY), tolerance=1e-3)
@@ -68,6 +69,7 @@ def simulated(spring: Spring, specimen: Specimen, t: Sequence[float], voltage: S
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bias", [SPRING, Spring(200.25, 20000.0), Spring(0.3, 1e-3)], ids=["spring", "stiff", "mass"])
 def test_creep_agrees_with_the_simulated_film_on_a_soft_rig(bias: Spring) -> None:
     """A stage that stands still behind a compliance is a spring; a very soft one is a mass."""
@@ -105,6 +107,7 @@ def test_exact_scalings() -> None:
     np.testing.assert_allclose(scaled(split, 1.0), h, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_mass_is_put_on_and_taken_off() -> None:
     """A film with pre-stretch is flat again at once; one without is too long for its ring, and hangs."""
     t, share = [0.0, 1.0, 50.0, 50.1, 60.0, 61.0, 80.0], [0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0]
@@ -119,6 +122,7 @@ def test_a_mass_is_put_on_and_taken_off() -> None:
     assert np.isnan(hangs.h[3:]).all() and np.isnan(hangs.error_estimate[3:]).all()
 
 
+@pytest.mark.slow
 def test_a_disk_that_jumps_has_a_status_and_no_number() -> None:
     specimen = film(TWO, 1.0)
     times = [0.0, 100.0, 1000.0]

@@ -33,6 +33,7 @@ def simulated(elements: int, steps: int) -> Array:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_force_of_a_folded_film_agrees_with_the_simulated_one() -> None:
     coarse, fine = (simulated(6, steps) for steps in (8, 16))
     exact = fine + (fine - coarse) / 3.0  # of the second order in time

@@ -171,7 +171,7 @@ def test_a_case_of_a_free_disk() -> None:
     assert 8e-3 < hangs["h"][0] < hangs["h"][1] < hangs["h"][2] < 9.63e-3  # the relaxed film is at 9.628 mm
     assert all(0.0 < one < 1e-2 for one in hangs["error_estimate"])
     words = (
-        "history.weight and bias",
+        "weight and bias",
         "allowed are mass",
         "lacks the key 'stiffness'",
         "an object",
