@@ -110,7 +110,7 @@ def identify_logs(
     records: list[Record] = []
     try:
         for run, scene in zip(runs, scenes, strict=True):
-            mine = _curves_of(run, scene)
+            mine = curves_in(run, scene)
             curves += mine
             if branches and mine:
                 records.append(_record(run, mine[0], run.certificates))
@@ -136,8 +136,8 @@ def identify_logs(
     return replace(identified, runs=runs, truth=_truth(runs, scenes), notes=[*_notes(runs), *identified.notes])
 
 
-def _curves_of(run: Run, scene: Scene) -> list[Curve]:
-    """The recorded curves of a run with what is known of their errors."""
+def curves_in(run: Run, scene: Scene) -> list[Curve]:
+    """The curves of a run as a fit takes them. Raises `CurveError` for one that cannot be used."""
     certificates = run.certificates
     joining = registry.joining({phase.kind for phase in run.phases})
     found = run.curves(scene.specimen.specimen(), joining, **_errors(run, scene, certificates))
@@ -159,7 +159,7 @@ def read_records(paths: Sequence[Path]) -> list[Record]:
         run = load_run(path)
         scene = parse_table(run.scene, Scene, "scene", f"{run.log.path} (scene.toml inside)")
         try:
-            curves = _curves_of(run, scene)
+            curves = curves_in(run, scene)
             if not curves:
                 raise DataError(f"{path}: the log holds no recorded curve: did the run end before the first sweep?")
             records.append(_record(run, curves[0], run.certificates))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ from calibration.film.planning import LEAST_DWELL, Dwell, Places, one_term, prop
 from calibration.film.propagation import Statement
 from calibration.sensors.certificate import Certificate
 from model.material.materials import Material
-from model.membrane.solve import Status, solve_many
 from model.specimen import Specimen
 from rig.analysis.film import errors_of
 from rig.base.errors import ConfigError, LimitError
@@ -24,12 +23,12 @@ from rig.protocol.experiment import certificates_of
 from rig.protocol.plan import plan
 from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
-from rig.safety.limits import Limits
 from rig.scene.scene import Scene, load_scene
 from rig.steps.approach import Approach
 from rig.steps.base import Step
 from rig.steps.hold import Hold
 from rig.steps.home import Home
+from rig.steps.places import grid
 from rig.steps.precondition import Precondition
 from rig.steps.ramp import Ramp
 from rig.steps.return_ import Return
@@ -39,8 +38,6 @@ from rig.steps.zero import Zero
 
 Array = NDArray[np.float64]
 
-MARGIN = 0.95  # of the limits of force, field, displacement and voltage: the film is not quite what is believed of it
-LEVELS, DISPLACEMENTS = 7, 25  # of the grid of places
 WEIGHTS = (1.0, 3.0, 9.0)  # of the stiffness against the permittivity
 SETTLE_S = 1.0  # after a voltage
 ZERO_S = 3.0
@@ -109,7 +106,12 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
     sweep = uniform_sweep(scene, certificates, time, sweep_h, sweep_v)
     curves = recorded(sweep, scene, certificates, specimen)
     stated = expected(curves, specimen.material)
-    errors = curves[0]
+    known = errors_of(scene, certificates)  # of one sample: those of the curves stand for several each
+    errors = replace(
+        curves[0],
+        force_noise=known["force_noise"],
+        displacement_noise=known.get("displacement_noise", 0.0),
+    )
     places = Places(specimen, h, voltage, scene.rates["force"], errors, stated.stretch)
     wanted = ("stiffness", "eps_r") if (voltage > 0.0).any() else ("stiffness",)
     uniform = _design(sweep, scene, stated, stated.stretch[0])
@@ -134,26 +136,11 @@ def propose_protocol(scene_path: Path, time: float, film: Material | None = None
 
 def reachable(scene: Scene, specimen: Specimen) -> tuple[Array, Array, float, float]:
     """Displacements and voltages at which the film may be held; displacement and voltage of the best uniform sweep."""
-    limits = Limits.of(scene)
-    top_h = MARGIN * limits.displacement.high
-    top_v = MARGIN * limits.voltage.high if scene.hv is not None else 0.0
-    levels = np.unique(np.floor(np.linspace(0.0, top_v, LEVELS) / 10.0) * 10.0)
-    h, voltage = (
-        one.ravel() for one in np.meshgrid(np.round(np.linspace(0.05 * top_h, top_h, DISPLACEMENTS), 5), levels)
-    )
-    states = solve_many(specimen, h, voltage, sensitivities=True)
-    slopes = states.dforce
+    places = grid(scene, specimen, sensitivities=True)
+    h, voltage, allowed, slopes = places.h, places.voltage, places.allowed, places.states.dforce
     assert slopes is not None
-    allowed = (
-        (states.status == Status.TAUT)
-        & (states.force <= MARGIN * limits.force.high)
-        & (states.peak_field <= MARGIN * limits.field.high)
-        & (states.min_hoop_stress >= limits.hoop_stress.low + (1.0 - MARGIN) * specimen.material.shear_modulus)
-    )
-    if not allowed.any():
-        raise LimitError("The model knows no displacement and voltage at which this film may be held: see the limits.")
     # A voltage that allows little displacement tells little: the sweep is at the one that tells most.
-    here = {level: allowed & (voltage == level) for level in levels if level > 0.0}
+    here = {level: allowed & (voltage == level) for level in np.unique(voltage) if level > 0.0}
     told = {level: float(np.mean(slopes["eps_r"][rows] ** 2)) for level, rows in here.items() if rows.any()}
     best = max(told, key=lambda level: told[level], default=0.0)
     sweep_h = float(h[allowed & (voltage == best)].max())
@@ -320,7 +307,7 @@ def protocol_text(protocol: Protocol) -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse_time(text: str) -> float:
+def parse_time(text: str, option: str = "--time") -> float:
     """Seconds from ``10min``, ``90 s`` or ``1.5h``.
 
     Raises
@@ -338,4 +325,4 @@ def parse_time(text: str) -> float:
             if 0.0 < time <= 86_400.0:
                 return time
             break
-    raise ConfigError(f"--time {text!r}: give a time up to 24 hours with its unit: 10min, 300s or 1.5h.")
+    raise ConfigError(f"{option} {text!r}: give a time up to 24 hours with its unit: 10min, 300s or 1.5h.")

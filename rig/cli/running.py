@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,6 +22,8 @@ from rig.run.run import Consent
 from rig.run.run import run as run_experiment
 from rig.safety.arming import undetectable
 from rig.scene.scene import Scene
+from rig.steps.advisor import Advisor
+from rig.steps.learn import Learn
 
 
 def prepare_step(scene: Path, title: str, step: Mapping[str, Any], ports: dict[str, Any] | None) -> Experiment:
@@ -63,7 +66,16 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
         with Display(f"{word}: {kind}. {scene.specimen.name}: {experiment.protocol.title}", word) as display:
             if arm and highest > 0 and scene.on_real_ports:
                 display.say(undetectable(_second(scene)))
-            outcome = run_experiment(experiment, out, lambda done, total, label: None, consent, display.say, show=show)
+            with _advisor(experiment, out) as advisor:
+                outcome = run_experiment(
+                    experiment,
+                    out,
+                    lambda done, total, label: None,
+                    consent,
+                    display.say,
+                    show=show,
+                    advisor=advisor,
+                )
     except (RigError, DeviceError) as error:
         if not begun and scene.on_real_ports and isinstance(error, FaultError | DeviceError):
             for line in others_on_its_ports(scene):
@@ -73,6 +85,15 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
     said = f"{word}: {out}: {outcome.reason} after {outcome.duration:.0f} s; {outcome.state}."
     tell(said, "stdout")
     _tell_elsewhere(experiment, out, 0, said)
+
+
+def _advisor(experiment: Experiment, out: Path) -> AbstractContextManager[Advisor | None]:
+    """Who fits for a closed loop, where the protocol has one."""
+    if not any(isinstance(step, Learn) for step in experiment.protocol.step):
+        return nullcontext()
+    from rig.analysis.refitting import RefitProcess
+
+    return RefitProcess(experiment, out)
 
 
 def _second(scene: Scene) -> str:

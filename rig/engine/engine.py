@@ -35,6 +35,7 @@ from rig.safety.arming import Arming
 from rig.safety.guard import AT_ONCE_S, GIVE_BACK, AnyGuard, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limit, Limits
 from rig.safety.second import SecondReading
+from rig.steps.advisor import Advisor
 from rig.steps.base import Action, Result, Turns, write_phase
 from rig.steps.output import choose_about_live_output, confirm_voltage
 from rig.steps.regain import regain_duration
@@ -88,6 +89,8 @@ class Engine:
         The guard, when it is a process of its own; without it the engine makes one for a supply in memory.
     show : callable, optional
         ``show(status)`` about five times a second, before ``progress``; as that, it must return at once.
+    advisor : Advisor, optional
+        Who fits for a closed loop.
     """
 
     def __init__(
@@ -103,6 +106,7 @@ class Engine:
         take_down: str = "",
         guard_process: RemoteGuard | None = None,
         show: Callable[[Status], None] | None = None,
+        advisor: Advisor | None = None,
     ) -> None:
         self.bench = bench
         self.clock = bench.clock
@@ -110,9 +114,10 @@ class Engine:
         self.recorder = Recorder(log, self.clock, gains, has_laser=bench.scene.displacement is not None)
         self.limits = Limits.of(bench.scene)
         self.control = control
-        highest = max((level for action in actions for level in action.voltage), default=0.0)
+        highest = max((action.highest_voltage for action in actions), default=0.0)
         arming = Arming(requested)
         self.rig = Rig(bench, self.recorder, self.limits, gains, control, arming, highest, take_down)
+        self.rig.advisor = advisor
         self._actions = actions
         self._progress = progress
         self._certificates = certificates or {}
@@ -196,7 +201,7 @@ class Engine:
         for action in self._actions:
             if action.by.hands:
                 return True
-            if max(action.voltage) > 0:
+            if action.highest_voltage > 0:
                 return False
         return False
 
@@ -340,10 +345,13 @@ class Engine:
             cycle=action.cycle,
             record=action.record,
         )
+        self.rig.doing = ""
         label = self._doing = self.control.doing = f"step {action.step} {action.kind}: {action.label}"
         with closing(action.carry_out(self.rig)) as turns:
             for _ in turns:
-                self._show_now_and_then(done + min(self.clock.now() - began, action.duration), total, label)
+                shown = f"{label}; {self.rig.doing}" if self.rig.doing else label
+                self.control.doing = shown
+                self._show_now_and_then(done + min(self.clock.now() - began, action.duration), total, shown)
                 try:
                     self._turn()
                 except (LimitError, FaultError) as error:

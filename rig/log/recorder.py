@@ -215,6 +215,10 @@ class Recorder:
             unit=unit,
         )
 
+    def decision(self, fields: Mapping[str, object]) -> None:
+        """Write what a closed loop does next, and why."""
+        self._write("/decision", self._clock.now(), **fields)
+
     def cycle(self, fields: Mapping[str, object]) -> None:
         """Write the summary of a cycle that has ended."""
         self._write("/cycle", self._clock.now(), about=None, **fields)

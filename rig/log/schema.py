@@ -161,6 +161,26 @@ CHANNELS: dict[str, Channel] = {
             Field("unit", "string", "unit of value and uncertainty"),
         ),
     ),
+    "/decision": Channel(
+        "Decision",
+        (
+            _T,
+            Field("step", "uint32", "index of the protocol step that decides"),
+            Field("number", "uint32", "of the decision, from 1; a run taken up again goes on counting"),
+            Field("outcome", "string", "go: on to the next place; met, unreachable, time, failed"),
+            Field("reason", "string", "in words"),
+            Field("displacement_m", "double", "where to measure next, in metres; NaN where there is no next place"),
+            Field("voltage_V", "double", "at what voltage, in volts; NaN likewise"),
+            Field("hold_s", "double", "for how long, in seconds"),
+            Field("quantity", "string", "of those wanted the one farthest from it; empty before there is a fit"),
+            Field("value", "double", "of that quantity by the fit so far, in SI units; NaN before"),
+            Field("standard_uncertainty", "double", "its standard uncertainty, of the parts that count; NaN before"),
+            Field("relative_uncertainty", "double", "the same over the value; NaN before"),
+            Field("wanted", "double", "relative standard uncertainty that is wanted of it; NaN before"),
+            Field("spent_s", "double", "seconds of the rig in this step so far, earlier runs included"),
+            Field("expected_s", "double", "seconds that it will still take, as far as can be told; NaN: cannot"),
+        ),
+    ),
     "/cycle": Channel(
         "Cycle",
         (

@@ -45,6 +45,7 @@ class Experiment:
     resumed: dict[str, str] | None = None  # of which log this is the rest, for the log
     stored_zero: float | None = None  # of the force sensor, from the run that this one goes on with
     campaign: dict[str, str] | None = None  # of which one this is a run, for the log
+    earlier: tuple[Path, ...] = ()  # logs of the runs that this one goes on with
     served: bool = False  # the ports are those that ``dea-rig sim`` printed
 
     @property
@@ -64,7 +65,7 @@ class Experiment:
     @property
     def highest_voltage(self) -> float:
         """The highest voltage planned (V)."""
-        return max((level for action in self.actions for level in action.voltage), default=0.0)
+        return max((action.highest_voltage for action in self.actions), default=0.0)
 
     @property
     def duration(self) -> float:
@@ -157,7 +158,7 @@ def _check_ranges(certificates: dict[str, Certificate], actions: list[Action], p
     for action, prediction in zip(actions, predictions, strict=True):
         if action.by.calibrates:
             continue
-        for role, value, unit in (("force", prediction.peak_force, "N"), ("hv", max(action.voltage), "V")):
+        for role, value, unit in (("force", prediction.peak_force, "N"), ("hv", action.highest_voltage, "V")):
             used = certificates.get(role)
             if used is not None and not value <= used.high:
                 raise LimitError(

@@ -73,9 +73,9 @@ def check_plan(actions: Sequence[Action], scene: Scene, force_noise: float = 0.0
     """
     limits = Limits.of(scene)
     specimen = scene.specimen.specimen()
-    predictions = []
     known: dict[object, Prediction] = {}  # a cycle is predicted once
-    for action in actions:
+
+    def hold(action: Action) -> Prediction:
         where = f"Step {action.step} ({action.kind}, {action.label})"
         action.check(specimen, limits, force_noise)
         limits.displacement.check(max(action.h), where)
@@ -98,5 +98,18 @@ def check_plan(actions: Sequence[Action], scene: Scene, force_noise: float = 0.0
         limits.stretch.check(prediction.peak_stretch, f"{where}, predicted")
         if prediction.status is Status.WRINKLED:
             raise LimitError(no_taut_state)
-        predictions.append(prediction)
-    return predictions
+        return worst([prediction, *map(hold, action.may)])
+
+    return [hold(action) for action in actions]
+
+
+def worst(found: Sequence[Prediction]) -> Prediction:
+    """The extremes of several."""
+    return Prediction(
+        peak_force=max(one.peak_force for one in found),
+        peak_field=max(one.peak_field for one in found),
+        minimum_hoop_stress=min(one.minimum_hoop_stress for one in found),
+        stored_energy=max(one.stored_energy for one in found),
+        peak_stretch=max(one.peak_stretch for one in found),
+        status=max(one.status for one in found),
+    )

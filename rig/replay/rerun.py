@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
@@ -16,8 +17,9 @@ from rig.operator.control import Answer, Control, Question
 from rig.protocol.experiment import gains_of
 from rig.replay.bench import Departure, ReplayBench
 from rig.replay.recording import OperatorAct, Recording
-from rig.replay.steering import SteeredBench
+from rig.replay.steering import NANOSECONDS, SteeredBench
 from rig.replay.verify import GUARDED
+from rig.steps.advisor import Advice, Ask
 
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
@@ -100,6 +102,7 @@ def rerun(recording: Recording, *, steered: bool | None = None) -> Rerun:
         experiment.certificates,
         requested=AS_RECORDED,
         take_down=AS_RECORDED if operator.took_down else "",
+        advisor=_Advisor(recording),
     )
     try:
         outcome, _ = engine.run()
@@ -177,6 +180,24 @@ class _Operator(Control):
 
     def _reply(self, question: Question, recorded: OperatorAct) -> None:
         self.answer = Answer(question.expected or recorded.text, AS_RECORDED)
+
+
+class _Advisor:
+    """Advises what was decided then, at the same instants."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._decisions = deque(row for row in recording.rows if row.topic == "/decision")
+
+    def ask(self, question: Ask, now: float) -> None:
+        """Nothing is worked out again."""
+
+    def answer(self, now: float, stopping: Callable[[], bool]) -> Advice | None:
+        if not self._decisions or now < self._decisions[0].t - NANOSECONDS:
+            return None
+        return Advice.from_fields(self._decisions.popleft().fields)
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 class _Again(ReplayBench):

@@ -66,7 +66,7 @@ def prepare_resumed(
         f"of {ended} left it, and nothing in the way of the stage, which finds its reference position first?"
     )
     certificates = _certificates(log)
-    done = cycles_done(log, first)
+    done = counted(log, first)
     actions = plan_resumed(protocol, scene, first, still_valid, question, done)
     plan(protocol, scene)  # what is left must belong to a protocol that can be carried out
     experiment = Experiment(
@@ -86,6 +86,7 @@ def prepare_resumed(
             **({} if done is None else {CYCLES: str(done.count), REFERENCE: repr(done.reference)}),
         },
         stored_zero=_force_zero(log),
+        earlier=(*_earlier(log), path),
         served=served,
     )
     _check_bench(experiment, bench_of(log), path)
@@ -160,6 +161,25 @@ def cycles_done(log: Log, step: int) -> CyclesDone | None:
         if message.fields["name"] == "cycle_response" and began[-1:] == [step]:
             reference = message.fields["value"]
     return CyclesDone(count, reference) if count else None
+
+
+def counted(log: Log, step: int) -> CyclesDone | None:
+    """What the run of ``log`` had counted of a step: cycles, or the questions of a closed loop and their seconds."""
+    found = cycles_done(log, step)
+    for message in log.messages("/decision"):
+        if message.fields["step"] == step:
+            found = CyclesDone(message.fields["number"], message.fields["spent_s"])
+    return found
+
+
+def _earlier(log: Log) -> list[Path]:
+    """Logs of the runs that this one went on with, as far as they lie beside it; the first of them first."""
+    found: list[Path] = []
+    name = log.metadata.get("resumed", {}).get("log", "")
+    while name and (path := log.path.with_name(Path(name).name)).is_file() and path not in found:
+        found.append(path)
+        name = read_log(path).metadata.get("resumed", {}).get("log", "")
+    return found[::-1]
 
 
 def _force_zero(log: Log) -> float | None:

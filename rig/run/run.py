@@ -32,6 +32,7 @@ from rig.protocol.experiment import Experiment, gains_of
 from rig.run.backend import Backend
 from rig.safety.guard import ADVICE, NOT_SAFE
 from rig.scene.scene import Scene
+from rig.steps.advisor import Advisor
 
 RECORDED_PACKAGES = ("dea-rig", "numpy", "scipy", "mcap", "protobuf", "pydantic", "pyserial", "python-can")
 
@@ -57,10 +58,12 @@ def run(
     say: Callable[[str], None] = lambda text: None,
     origin: Mapping[str, Mapping[str, str]] | None = None,
     show: Callable[[Status], None] | None = None,
+    advisor: Advisor | None = None,
 ) -> Outcome:
     """Carry the experiment out and leave a finished log at ``out``.
 
     ``show`` is told about five times a second where the run stands, in numbers; it returns at once.
+    ``advisor`` fits for a closed loop; a protocol without one needs none.
     ``origin`` is what the log says of the versions and the host that made it, by default the true ones. On the
     simulated bench in memory nobody is asked anything: every question is answered as expected, and the log says so.
     Returns the outcome of a run that ended as planned.
@@ -111,6 +114,7 @@ def run(
                 take_down=consent.take_down,
                 guard_process=backend.guard,
                 show=show,
+                advisor=advisor,
             )
             if awake:
                 engine.recorder.event("info", "host", awake)

@@ -204,6 +204,16 @@ class Action(ABC):
         """
 
     @property
+    def may(self) -> tuple[Action, ...]:
+        """What it may do beside what ``h`` and ``voltage`` say, where that is decided on the way; checked like it."""
+        return ()
+
+    @property
+    def highest_voltage(self) -> float:
+        """The highest voltage that it may come to (V)."""
+        return max((*self.voltage, *(one.highest_voltage for one in self.may)))
+
+    @property
     def kept_s(self) -> float:
         """Seconds of it of which the log keeps everything."""
         return self.duration

@@ -26,6 +26,7 @@ from rig.steps.glide import Glide
 from rig.steps.hold import Hold
 from rig.steps.home import Home
 from rig.steps.jog import Jog
+from rig.steps.learn import Learn
 from rig.steps.meter import Meter
 from rig.steps.mount import Mount
 from rig.steps.precondition import Precondition
@@ -63,6 +64,7 @@ OWN: Mapping[str, type[Step]] = {
         Relax,
         Breakdown,
         Cycle,
+        Learn,
         Return,
         Follow,
         Mount,

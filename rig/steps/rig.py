@@ -18,12 +18,16 @@ from rig.operator.control import Answer, Control, Question
 from rig.safety.arming import Arming
 from rig.safety.guard import AnyGuard, GuardState
 from rig.safety.limits import Limits
+from rig.steps.advisor import Advisor
 from rig.steps.hands import Hands
 
 
 @dataclass(frozen=True)
 class CyclesDone:
-    """What a run that ended early had counted of a step: whole cycles, and what counts as 100 % of their response."""
+    """What a run that ended early had counted of a step: whole cycles, and what counts as 100 % of their response.
+
+    Of a closed loop: its questions, and the seconds that they took.
+    """
 
     count: int
     reference: float
@@ -51,6 +55,10 @@ class Rig:
         Told every sample as it arrives.
     on_readings : callable
         ``on_readings(role, readings)`` is told the readings of an unloaded sensor.
+    advisor : Advisor or None
+        Who fits for a closed loop.
+    doing : str
+        What a step adds to its label on the status line.
     counts : dict
         What a step has counted, by its number: it outlives the operator's pause.
     hands : Hands or None
@@ -84,6 +92,8 @@ class Rig:
         self.listener: Callable[[Sample], None] | None = None
         self.on_readings: Callable[[str, Sequence[float]], None] = lambda role, readings: None
         self.counts: dict[int, CyclesDone] = {}
+        self.advisor: Advisor | None = None
+        self.doing = ""
         self.hands: Hands | None = None if bench.simulated is None else bench.simulated.operator
 
     @property

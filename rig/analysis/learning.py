@@ -1,0 +1,180 @@
+"""Where to measure next, so that a film is known well enough in the least time: the choice of a closed loop.
+
+What a second of holding the film at a place tells is that of `calibration.film.planning.Places`. One reading ``r`` (a
+row of derivatives over its standard deviation) takes the variance ``v = w' M^-1 w`` of what is wanted to
+``v - t (w' M^-1 r)^2 / (1 + t r' M^-1 r)`` in ``t`` seconds (Sherman & Morrison), with ``M`` the information of all
+that was recorded. The next place is the one that lowers the logarithms of the variances most per second, the way there
+counted (sequential c-optimality; Wynn 1970).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.film.curve import Curve
+from calibration.film.planning import Places
+from calibration.film.result import Identification, Quantity
+from model.specimen import Specimen
+from rig.scene.scene import Scene
+from rig.steps.advisor import Advice, Ask, Kind
+from rig.steps.places import connected
+from rig.steps.wanted import BY_TIME, Wanted
+
+Array = NDArray[np.float64]
+
+HOLDS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
+TURN_S = 2.0  # what a question costs: the film is held where it is meanwhile
+LITTLE = 0.05  # weight of what is known well enough already
+CONFIRM_S = 8.0  # of new data before a claim is believed
+HOPELESS = 3  # fits in a row that say that it cannot be reached
+FIRST_STRETCH = 1.25  # times the pre-stretch: where the stiffness is wanted before there is a fit
+
+
+@dataclass
+class Learner:
+    """Chooses place after place for one step of one specimen.
+
+    Parameters
+    ----------
+    scene : Scene
+    wanted : sequence of Wanted
+    settle_s, speed : float
+        Of the step: wait after a voltage, speed of the disk (m/s).
+    """
+
+    scene: Scene
+    wanted: Sequence[Wanted]
+    settle_s: float = 1.0
+    speed: float = 5e-3
+    _met: int = 0
+    _hopeless: int = 0
+    _specimen: Specimen = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._specimen = self.scene.specimen.specimen()
+        grid = connected(self.scene, self._specimen)
+        self.h = np.concatenate(list(grid.values()))
+        self.voltage = np.repeat(list(grid), [len(h) for h in grid.values()])
+
+    def advise(self, curves: Sequence[Curve], found: Identification | None, question: Ask) -> Advice:
+        """What to do, by the curves recorded and the fit of them; None while there is none."""
+        stands = {} if found is None else self.standing(found.quantities)
+        if found is None or any(one.name not in found.quantities for one in self.wanted):
+            return self._next(curves, found, question, {}, "first places: there is no fit yet")
+        worst = max(self.wanted, key=lambda one: stands[one.name][0] / one.relative)
+        told = _about(worst, found.quantities[worst.name], stands[worst.name][0])
+        missing = [one for one in self.wanted if stands[one.name][0] > one.relative]
+        lost = [one for one in missing if stands[one.name][1] > one.relative]
+        self._hopeless = self._hopeless + 1 if lost else 0
+        self._met = 0 if missing else self._met + 1
+        if self._hopeless >= HOPELESS:
+            worst = lost[0]
+            part, size = _largest(found.quantities[worst.name], worst)
+            reason = f"{worst} cannot be reached by more time: {part} alone leaves {100 * size:.3g} %"
+            return Advice(
+                Kind.UNREACHABLE, reason, **_about(worst, found.quantities[worst.name], stands[worst.name][0])
+            )
+        if self._met > 1:
+            return Advice(Kind.MET, "known well enough, and so said the fit before", **told)
+        if question.left_s <= TURN_S:
+            return Advice(Kind.TIME, "the time is out", **told)
+        weights = {one.name: 1.0 if one in missing else LITTLE for one in self.wanted}
+        reason = "tells most per second" if missing else "known well enough; confirmed by new data"
+        chosen = self._next(curves, found, question, weights, reason)
+        hold = CONFIRM_S if not missing else chosen.hold_s
+        left = max((_time_left(stands[one.name], one, question.spent_s) for one in missing), default=0.0)
+        return Advice(Kind.GO, reason, chosen.h, chosen.voltage, hold, **told, expected_s=left)
+
+    def standing(self, quantities: Mapping[str, Quantity]) -> dict[str, tuple[float, float]]:
+        """By name of what is wanted: relative standard uncertainty, and what of it no time makes smaller."""
+        found = {}
+        for one in self.wanted:
+            if one.name in quantities:
+                quantity = quantities[one.name]
+                known = math.isfinite(quantity.uncertainty) and quantity.value != 0.0
+                found[one.name] = one.of(quantity.value, quantity.budget) if known else (math.inf, 0.0)
+        return found
+
+    def _next(
+        self,
+        curves: Sequence[Curve],
+        found: Identification | None,
+        question: Ask,
+        weights: Mapping[str, float],
+        reason: str,
+    ) -> Advice:
+        places = self._places(curves, found)
+        names = ("stiffness", "eps_r")[: len(places.wanted)]
+        asked = {one.name for one in self.wanted}
+        weight = np.array([weights.get(name, 1.0 if name in asked else 0.0) for name in names])
+        inverse = np.linalg.inv(places.prior + self._information(places, curves))
+        toward = places.rows @ inverse  # (K, P)
+        variance = np.einsum("jp,pq,jq->j", places.wanted, inverse, places.wanted)
+        gain_per = (places.wanted @ toward.T) ** 2 / variance[:, None]  # (J, K)
+        size = np.einsum("kp,kp->k", toward, places.rows)
+        holds = np.array(HOLDS_S)[:, None]
+        way = self._way(places, question)
+        lower = holds * gain_per[:, None] / (1.0 + holds * size)  # (J, D, K), of each variance
+        gain = np.einsum("j,jdk->dk", weight, -np.log1p(-np.minimum(lower, 1.0 - 1e-12)))
+        rate = gain / (holds + way + TURN_S)
+        rate[(holds + way) > max(question.left_s, HOLDS_S[0])] = -1.0
+        d, k = np.unravel_index(int(rate.argmax()), rate.shape)
+        return Advice(Kind.GO, reason, float(places.h[k]), float(places.voltage[k]), HOLDS_S[d])
+
+    def _places(self, curves: Sequence[Curve], found: Identification | None) -> Places:
+        specimen = self._specimen
+        stretch = (FIRST_STRETCH * specimen.prestretch, specimen.prestretch)
+        if found is not None:
+            specimen, stretch = specimen.with_material(found.material), found.stretch
+        return Places(specimen, self.h, self.voltage, self.scene.rates["force"], curves[0], stretch)
+
+    def _information(self, places: Places, curves: Sequence[Curve]) -> Array:
+        """That of the samples recorded so far, each at the nearest place."""
+        seconds = np.zeros(places.h.size)
+        for curve in curves:
+            here = np.flatnonzero(np.abs(places.voltage - curve.nominal_voltage) < 1.0)
+            if here.size:
+                h = curve.h[curve.usable]
+                nearest = here[np.abs(places.h[here][:, None] - h).argmin(axis=0)]
+                seconds += np.bincount(nearest, minlength=seconds.size) / self.scene.rates["force"]
+        information: Array = (places.rows * seconds[:, None]).T @ places.rows
+        return information
+
+    def _way(self, places: Places, question: Ask) -> Array:
+        """Seconds from where the film is to each place."""
+        ramp = self.scene.hv.ramp_V_per_s if self.scene.hv is not None else math.inf
+        change = np.abs(places.voltage - question.voltage)
+        way: Array = np.abs(places.h - question.h) / self.speed + change / ramp + self.settle_s * (change > 0.0)
+        return way
+
+
+def _about(wanted: Wanted, quantity: Quantity, relative: float) -> dict[str, float | str]:
+    """The fields of an advice that say how well a quantity is known."""
+    return {
+        "quantity": wanted.name,
+        "value": quantity.value,
+        "standard_uncertainty": relative * abs(quantity.value),
+        "relative": relative,
+        "wanted": wanted.relative,
+    }
+
+
+def _largest(quantity: Quantity, wanted: Wanted) -> tuple[str, float]:
+    """The largest part of what no time makes smaller, and its relative size."""
+    parts = {part: wanted.of(quantity.value, {part: size})[0] for part, size in quantity.budget.items()}
+    part = max((one for one in parts if one not in BY_TIME), key=lambda one: parts[one])
+    return part, parts[part]
+
+
+def _time_left(stands: tuple[float, float], wanted: Wanted, spent: float) -> float:
+    """Seconds by the rule that noise falls with the root of the time."""
+    relative, stays = stands
+    room = wanted.relative**2 - stays**2
+    if not (room > 0.0 and math.isfinite(relative)):
+        return math.nan
+    return max((relative**2 - stays**2) / room - 1.0, 0.0) * spent
