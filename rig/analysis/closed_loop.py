@@ -64,7 +64,7 @@ def closed_loop(scene_path: Path, until: str, at_most_s: float, terms: int) -> t
     if scene.hv is None and any(one.name == "eps_r" for one in wanted):
         raise ConfigError(f"--until {until!r}: {scene_path} has no [hv] instrument, so eps_r cannot be measured.")
     step = Learn(do="learn", until=until, at_most_min=at_most_s / 60.0, terms=terms)
-    top = float(connected(scene, scene.specimen.specimen())[0.0][-1])
+    top = connected(scene, scene.specimen.specimen())[0.0][-1]
     protocol = framed(scene, certificates, [step], top, f"Until {', '.join(map(str, wanted))}")
     found = outlooks(scene, certificates, wanted, at_most_s, terms)
     lost = [one for one in found if one.best * SURE > one.wanted.relative]
@@ -92,12 +92,12 @@ def outlooks(
         specimen = specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
     grid = connected(scene, specimen)
     top_v = max(grid)
-    sweep = uniform_sweep(scene, certificates, 600.0, float(grid[top_v][-1]), top_v)
+    sweep = uniform_sweep(scene, certificates, 600.0, grid[top_v][-1], top_v)
     curves = recorded(sweep, scene, certificates, specimen)
     stated = expected(curves, specimen.material)
     places = Places(
         specimen,
-        np.concatenate(list(grid.values())),
+        np.concatenate([np.array(h) for h in grid.values()]),
         np.repeat(list(grid), [len(h) for h in grid.values()]),
         scene.rates["force"],
         of_one_sample(curves[0], scene, certificates),

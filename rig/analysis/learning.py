@@ -58,7 +58,7 @@ class Learner:
     def __post_init__(self) -> None:
         self._specimen = self.scene.specimen.specimen()
         grid = connected(self.scene, self._specimen)
-        self.h = np.concatenate(list(grid.values()))
+        self.h = np.concatenate([np.array(h) for h in grid.values()])
         self.voltage = np.repeat(list(grid), [len(h) for h in grid.values()])
 
     def advise(self, curves: Sequence[Curve], found: Identification | None, question: Ask) -> Advice:

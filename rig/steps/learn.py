@@ -13,8 +13,6 @@ from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from rig.base.errors import FaultError, LimitError
@@ -31,7 +29,6 @@ LEAST_TIME_S = 60.0
 ANSWER_S = 60.0  # a fit that takes longer is given up
 FAILURES = 3  # fits in a row that fail: then the step ends, in order
 HOLD_ANYWAY_S = 10.0  # where the film is, after a fit that failed
-SAME_PLACE = 1e-9
 
 
 class Learn(Step):
@@ -92,14 +89,14 @@ class Learn(Step):
         )
 
     def _ways(
-        self, state: State, scene: Scene, places: Mapping[float, NDArray[np.float64]], speed: float
+        self, state: State, scene: Scene, places: Mapping[float, tuple[float, ...]], speed: float
     ) -> Iterator[Action]:
         """Between them everywhere it may be, for the model and the limits."""
         for level, h in places.items():
-            first = min(state.h, float(h[0])) if level == 0.0 else float(h[0])
+            first = min(state.h, h[0]) if level == 0.0 else h[0]
             at = State(number=state.number, h=first, voltage=level)
-            yield move_to(self, at, float(h[-1]), speed)
-            at = State(number=state.number, h=float(h[-1]))
+            yield move_to(self, at, h[-1], speed)
+            at = State(number=state.number, h=h[-1])
             yield voltage_to(self, at, scene, level, self.settle_s)
 
 
@@ -109,7 +106,7 @@ class Learning(Action):
 
     Attributes
     ----------
-    places : mapping of float to ndarray
+    places : mapping of float to tuple of float
         Displacements (m) that may be held at each voltage (V): `rig.steps.places.connected`.
     speed_between : float
         m/s, of the disk.
@@ -122,7 +119,7 @@ class Learning(Action):
     begins_anywhere: ClassVar[bool] = True
 
     by: Learn
-    places: Mapping[float, NDArray[np.float64]]
+    places: Mapping[float, tuple[float, ...]]
     speed_between: float
     ways: tuple[Action, ...]
     done: CyclesDone
@@ -174,9 +171,9 @@ class _Loop:
 
     def run(self) -> Turns:
         if self.number == 0:
-            top = float(self._action.places[0.0][-1])
+            top = self._action.places[0.0][-1]
             yield from self._move(top)
-            yield from self._move(float(self._action.places[0.0][0]))
+            yield from self._move(self._action.places[0.0][0])
         while True:
             advice = yield from self._advised()
             if self.left <= 0.0 and advice.kind in (Kind.GO, Kind.FAILED):
@@ -214,7 +211,7 @@ class _Loop:
 
     def _allowed(self, advice: Advice) -> bool:
         h = self._action.places.get(advice.voltage)
-        return h is not None and bool((np.abs(h - advice.h) < SAME_PLACE).any()) and math.isfinite(advice.hold_s)
+        return h is not None and advice.h in h and math.isfinite(advice.hold_s)
 
     def _tell(self, advice: Advice) -> None:
         rig = self._rig

@@ -57,14 +57,14 @@ def grid(scene: Scene, specimen: Specimen, *, sensitivities: bool = False) -> Gr
     return Grid(h, voltage, states, allowed)
 
 
-def connected(scene: Scene, specimen: Specimen) -> dict[float, Array]:
+def connected(scene: Scene, specimen: Specimen) -> dict[float, tuple[float, ...]]:
     """Displacements (m, rising) that may be held at each voltage (V), such that the way between any two is allowed.
 
     The way is at the lower voltage of the two. So the displacements of a voltage are neighbours, and each of them is
     among those of every lower voltage.
     """
     places = grid(scene, specimen)
-    found: dict[float, Array] = {}
+    found: dict[float, tuple[float, ...]] = {}
     below: Array | None = None
     for level in np.unique(places.voltage):
         here = places.voltage == level
@@ -73,7 +73,8 @@ def connected(scene: Scene, specimen: Specimen) -> dict[float, Array]:
             run = run[np.isin(run, below)]
         if run.size < 2:
             break
-        found[float(level)] = below = run
+        below = run
+        found[float(level)] = tuple(run.tolist())
     if not found:
         raise LimitError("The film may be held at no two neighbouring displacements without voltage: see the limits.")
     return found

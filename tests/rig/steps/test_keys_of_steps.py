@@ -51,6 +51,7 @@ LEAST: dict[str, tuple[str, dict[str, Any]]] = {
     "relax": ("contact", {"displacements_mm": [2.0, 4.0], "speed_mm_per_s": 5.0, "hold_s": 30.0, "voltage_V": 500.0}),
     "breakdown": ("contact", {"ceiling_V": 1500.0}),
     "cycle": ("contact", {"to_mm": 4.0, "period_s": 20.0, "cycles": 100, "waveform": "trapezoid"}),
+    "learn": ("contact", {"until": "eps_r 0.5 %"}),
     "return": ("raised", {}),
     "follow": ("contact", {"bias": SPRING, "voltages_V": [500.0]}),
     "mount": ("nothing", {"fixture": "none"}),
@@ -88,6 +89,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "stop_above_percent": None,
         "stop_leakage_nA": None,
     },
+    "learn": {"at_most_min": 60.0, "speed_mm_per_s": 5.0, "settle_s": 1.0, "terms": 2},
     "return": {"speed_mm_per_s": 2.0, "clearance_mm": 2.0},
     "follow": {"rate_Hz": 40.0, "speed_mm_per_s": 1.0, "settle_s": 1.0, "average_s": 5.0, "patience_s": 60.0},
     "mount": {},
@@ -182,6 +184,13 @@ MOVES: dict[str, dict[str, tuple[Any, set[str]]]] = {
         "stop_below_percent": (80.0, set()),
         "stop_above_percent": (120.0, set()),
         "stop_leakage_nA": (50.0, set()),
+    },
+    "learn": {  # the ways that it may go carry the step itself
+        "until": ("eps_r 1 %", {"label", "ways"}),
+        "at_most_min": (30.0, {"duration", "ways"}),
+        "speed_mm_per_s": (2.0, {"speed_between", "ways"}),
+        "settle_s": (2.0, {"ways"}),
+        "terms": (1, {"ways"}),  # of the fits
     },
     "return": {
         "speed_mm_per_s": (1.0, {"duration", "speed"}),
@@ -305,6 +314,16 @@ BOUNDS: dict[str, dict[str, tuple[list[Any], list[Any]]]] = {
         "stop_below_percent": ([TINY, 100.0 - TINY], [0.0, 100.0]),
         "stop_above_percent": ([100.0 + TINY, 1000.0 - TINY], [100.0, 1000.0]),
         "stop_leakage_nA": POSITIVE,
+    },
+    "learn": {
+        "until": (
+            ["eps_r 0.5 %", "eps_r 0.5 %, stiffness 1 %", "stiffness 1e-3 % noise and zeros", "EPS_R 50 %"],
+            ["", "eps_r", "eps_r 0.5", "eps_r 0 %", "eps_r -1 %", "esp_r 1 %", "eps_r 1 %, eps_r 2 %", "eps_r 51 %"],
+        ),
+        "at_most_min": ([1.0, 1440.0], [1.0 - TINY, 1440.1]),
+        "speed_mm_per_s": POSITIVE,
+        "settle_s": NOT_NEGATIVE,
+        "terms": ([1, 3], [0, 4, 1.5]),
     },
     "return": {"speed_mm_per_s": POSITIVE, "clearance_mm": NOT_NEGATIVE},
     "follow": {
@@ -460,7 +479,7 @@ def test_the_facts_of_a_step_are_those_of_its_actions(do: str, scene: Any) -> No
     asks = {"prompt", "mount", "weigh", "jog"}  # whoever is asked to do something there touches the rig
     assert step.hands is (do in asks)
     assert step.needs_contact is (
-        do in {"precondition", "ramp", "voltage", "sweep", "relax", "breakdown", "cycle", "follow"}
+        do in {"precondition", "ramp", "voltage", "sweep", "relax", "breakdown", "cycle", "follow", "learn"}
     )
     assert step.finds_contact is (do == "approach")
 
