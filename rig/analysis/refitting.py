@@ -126,9 +126,8 @@ class RefitProcess:
         if data is None:
             return None
         if not data:
-            code = process.poll()
             self._end()
-            return Advice(Kind.FAILED, f"the process that fits has ended ({'killed' if code and code < 0 else code})")
+            return Advice(Kind.FAILED, "the process that fits has ended")
         self._heard += data
         if not self._heard.endswith(b"\n"):
             return None

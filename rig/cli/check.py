@@ -88,7 +88,7 @@ def summary(experiment: Experiment, log_bytes: int | None = None) -> str:
     limits, predictions = Limits.of(experiment.scene), experiment.predictions
     reached = [
         (limits.force, max((one.peak_force for one in predictions), default=0.0)),
-        (limits.displacement, max((end for action in experiment.actions for end in action.h), default=0.0)),
+        (limits.displacement, max((end for action in experiment.actions for end in action.ends), default=0.0)),
     ]
     if experiment.scene.hv is not None:
         reached.append((limits.voltage, experiment.highest_voltage))

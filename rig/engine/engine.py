@@ -278,7 +278,7 @@ class Engine:
         if any(action.by.finds_contact for action in self._actions):
             travel = Limit("stage position", *self.bench.stage.travel, "mm", 1e3)
             travel.check(start, "stage.approach_from_mm, for this stage")
-            ends = [end for action in self._actions for end in action.h]
+            ends = [end for action in self._actions for end in action.ends]
             travel.check(start + min(ends), "Clearance of the return step, where the film can be met first")
             travel.check(start + max(ends), "Largest displacement, where the film can be met first")
 

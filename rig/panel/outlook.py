@@ -50,10 +50,10 @@ def outlook(scene_text: str, protocol_text: str) -> dict[str, Any]:
         }
         for action, start in zip(actions, starts[:-1], strict=True)
     ]
-    levels = sorted({level for action in actions for level in action.voltage})
+    levels = sorted({level for action in actions for level in action.levels})
     if len(levels) > MOST_LEVELS:
         levels = [levels[k] for k in np.linspace(0, len(levels) - 1, MOST_LEVELS).round().astype(int)]
-    deepest = max((end for action in actions for end in action.h), default=0.0)
+    deepest = max((end for action in actions for end in action.ends), default=0.0)
     return {
         "title": protocol.title,
         "steps": steps,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 from rig.bench.bench import Bench
 from rig.bench.opening import open_memory
-from rig.engine.engine import Engine
+from rig.engine.engine import LONGEST_TURN_S, Engine
 from rig.engine.outcome import Outcome
 from rig.log.nowhere import NoLog
 from rig.operator.control import Answer, Control, Question
@@ -187,12 +187,14 @@ class _Advisor:
 
     def __init__(self, recording: Recording) -> None:
         self._decisions = deque(row for row in recording.rows if row.topic == "/decision")
+        # Led through its turns, the clock shows when the turn began in which the answer came.
+        self._early = NANOSECONDS if recording.in_virtual_time else LONGEST_TURN_S
 
     def ask(self, question: Ask, now: float) -> None:
         """Nothing is worked out again."""
 
     def answer(self, now: float, stopping: Callable[[], bool]) -> Advice | None:
-        if not self._decisions or now < self._decisions[0].t - NANOSECONDS:
+        if not self._decisions or now < self._decisions[0].t - self._early:
             return None
         return Advice.from_fields(self._decisions.popleft().fields)
 

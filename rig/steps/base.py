@@ -209,9 +209,19 @@ class Action(ABC):
         return ()
 
     @property
+    def ends(self) -> tuple[float, ...]:
+        """Displacements (m) at the ends of all ways that it may go."""
+        return (*self.h, *(end for one in self.may for end in one.ends))
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Voltages (V) likewise."""
+        return (*self.voltage, *(level for one in self.may for level in one.levels))
+
+    @property
     def highest_voltage(self) -> float:
         """The highest voltage that it may come to (V)."""
-        return max((*self.voltage, *(one.highest_voltage for one in self.may)))
+        return max(self.levels)
 
     @property
     def kept_s(self) -> float:

@@ -11,9 +11,11 @@ from enum import StrEnum
 NAMES = ("stiffness", "eps_r")
 LOWEST, HIGHEST = 1e-5, 0.5  # relative; beyond it nothing is meant
 EXAMPLE = '"eps_r 0.5 %", or several with commas: "eps_r 0.5 %, stiffness 1 %"'
-# What no time of the rig makes smaller, and what it does.
+# Entries of a budget: what is stated of specimen and instruments, and what more time of the rig makes smaller.
 DIMENSIONS = ("thickness", "pre-stretch", "disk radius", "ring radius")
-BY_TIME = ("noise", "force zero", "displacement zero")
+STATED = ("force gain", "displacement gain", "displacement axis", "voltage gain", "voltage at the film")
+STATED += (*DIMENSIONS, "eccentricity")
+BY_TIME = ("noise", "force zero", "displacement zero", "lag", "compliance", "range of exponents", "other solutions")
 
 
 class Counts(StrEnum):
@@ -41,14 +43,10 @@ class Wanted:
     def of(self, value: float, budget: Mapping[str, float]) -> tuple[float, float]:
         """Relative standard uncertainty of a quantity with this budget; and what of it no time makes smaller.
 
-        Of noise and zeros, what a lack of fit adds counts too, for time does not lower it and it is an error of the
-        quantity.
+        With noise and zeros count whatever is not stated of specimen and instruments: a lack of fit, too.
         """
-        if self.counts is Counts.NOISE_AND_ZEROS:
-            parts = {part: size for part, size in budget.items() if part in (*BY_TIME, "lack of fit")}
-        else:
-            left_out = DIMENSIONS if self.counts is Counts.GIVEN_DIMENSIONS else ()
-            parts = {part: size for part, size in budget.items() if part not in left_out}
+        left_out = {Counts.NOISE_AND_ZEROS: STATED, Counts.GIVEN_DIMENSIONS: DIMENSIONS}.get(self.counts, ())
+        parts = {part: size for part, size in budget.items() if part not in left_out}
         square = sum(size**2 for size in parts.values())
         stays = sum(size**2 for part, size in parts.items() if part not in BY_TIME)
         return square**0.5 / abs(value), stays**0.5 / abs(value)

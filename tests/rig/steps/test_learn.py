@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration.film.propagation import NUISANCES
+from calibration.film.systematic import SYSTEMATIC
 from rig.analysis.refitting import RefitProcess
 from rig.base.errors import Breakdown, FaultError, LimitError, Stopped
 from rig.base.toml_file import parse_table
@@ -30,7 +32,7 @@ from rig.scene.scene import load_scene
 from rig.steps.advisor import Advice, Ask, Kind
 from rig.steps.learn import FAILURES, Learning
 from rig.steps.places import connected
-from rig.steps.wanted import Counts, parse_wanted
+from rig.steps.wanted import BY_TIME, STATED, Counts, parse_wanted
 
 SCENE = Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml"
 PROTOCOL = """
@@ -136,6 +138,12 @@ def test_several_wishes_and_which_parts_count() -> None:
     assert one.of(1.0, budget) == pytest.approx((np.hypot(0.03, 0.12), 0.12))
 
 
+def test_what_is_stated_and_what_time_lowers_are_entries_of_the_budget() -> None:
+    assert set(STATED) == {part for part, *_ in SYSTEMATIC} | {"eccentricity"}
+    assert {kind.replace("_", " ") for kind in NUISANCES} < set(BY_TIME)
+    assert not set(STATED) & set(BY_TIME)
+
+
 # --- What may be done
 
 
@@ -225,7 +233,6 @@ def test_stopped_while_a_fit_runs_it_is_safe_and_goes_on_at_the_next_question(
     advisor = carry_out(rest, again, [ends(Kind.MET)])
     (question,) = advisor.questions
     assert question.number == 2 and question.spent_s >= spent[0]
-    assert rerun(load_recording(again)).exit_code == 0
 
 
 @pytest.mark.slow
@@ -233,7 +240,7 @@ def test_a_film_that_breaks_down_ends_it_safely(
     experiment: Experiment, places: dict[float, tuple[float, ...]], tmp_path: Path
 ) -> None:
     scene = experiment.scene
-    film = scene.simulation.film.model_copy(update={"breakdown_V_per_um": 25.0})
+    film = scene.simulation.film.model_copy(update={"breakdown_field_MV_per_m": 25.0})
     weak = scene.model_copy(update={"simulation": scene.simulation.model_copy(update={"film": film})})
     volts = max(places)
     out = tmp_path / "run.mcap"
@@ -255,7 +262,7 @@ def test_a_process_that_dies_is_told_and_the_next_question_has_another(experimen
         assert first is not None
         os.kill(first, signal.SIGKILL)
         told = process.answer(10.0, lambda: False)
-        assert told is not None and told.kind is Kind.FAILED and "killed" in told.reason
+        assert told is not None and told.kind is Kind.FAILED and "has ended" in told.reason
         process.ask(Ask(2, 0.0, 0.0, 1.0, 50.0), 20.0)
         second = process.pid
         assert second not in (None, first)
