@@ -5,6 +5,10 @@ row of derivatives over its standard deviation) takes the variance ``v = w' M^-1
 ``v - t (w' M^-1 r)^2 / (1 + t r' M^-1 r)`` in ``t`` seconds (Sherman & Morrison), with ``M`` the information of all
 that was recorded. The next place is the one that lowers the logarithms of the variances most per second, the way there
 counted (sequential c-optimality; Wynn 1970).
+
+A claim is not believed below what the information of these data says for the film of the scene with all its parameters
+free. With few places a term of the law may vanish in the fit; then it states less uncertainty than it has, and whoever
+stops as soon as the stated one is small would stop at such fits.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from rig.steps.wanted import BY_TIME, Wanted
 
 Array = NDArray[np.float64]
 
+QUANTITIES = ("stiffness", "eps_r")  # in the order of `Places.wanted`
 HOLDS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
 TURN_S = 2.0  # what a question costs: the film is held where it is meanwhile
 LITTLE = 0.05  # weight of what is known well enough already
@@ -63,7 +68,7 @@ class Learner:
 
     def advise(self, curves: Sequence[Curve], found: Identification | None, question: Ask) -> Advice:
         """What to do, by the curves recorded and the fit of them; None while there is none."""
-        stands = {} if found is None else self.standing(found.quantities)
+        stands = {} if found is None else self.standing(curves, found)
         if found is None or any(one.name not in found.quantities for one in self.wanted):
             return self._next(curves, found, question, {}, "first places: there is no fit yet")
         worst = max(self.wanted, key=lambda one: stands[one.name][0] / one.relative)
@@ -90,14 +95,18 @@ class Learner:
         left = max((_time_left(stands[one.name], one, question.spent_s) for one in missing), default=0.0)
         return Advice(Kind.GO, reason, chosen.h, chosen.voltage, hold, **told, expected_s=left)
 
-    def standing(self, quantities: Mapping[str, Quantity]) -> dict[str, tuple[float, float]]:
+    def standing(self, curves: Sequence[Curve], fit: Identification) -> dict[str, tuple[float, float]]:
         """By name of what is wanted: relative standard uncertainty, and what of it no time makes smaller."""
+        believed = self._places(curves, self._specimen, fit.stretch)
+        inverse = np.linalg.inv(believed.prior + self._information(believed, curves))
+        least = np.sqrt(np.einsum("jp,pq,jq->j", believed.wanted, inverse, believed.wanted)).tolist()
         found = {}
-        for one in self.wanted:
-            if one.name in quantities:
-                quantity = quantities[one.name]
-                known = math.isfinite(quantity.uncertainty) and quantity.value != 0.0
-                found[one.name] = one.of(quantity.value, quantity.budget) if known else (math.inf, 0.0)
+        for one, quantity in ((one, fit.quantities[one.name]) for one in self.wanted if one.name in fit.quantities):
+            if not (math.isfinite(quantity.uncertainty) and quantity.value):
+                found[one.name] = (math.inf, 0.0)
+                continue
+            relative, stays = one.of(quantity.value, quantity.budget)
+            found[one.name] = (max(relative, math.hypot(stays, least[QUANTITIES.index(one.name)])), stays)
         return found
 
     def _next(
@@ -108,8 +117,11 @@ class Learner:
         weights: Mapping[str, float],
         reason: str,
     ) -> Advice:
-        places = self._places(curves, found)
-        names = ("stiffness", "eps_r")[: len(places.wanted)]
+        specimen, stretch = self._specimen, (FIRST_STRETCH * self._specimen.prestretch, self._specimen.prestretch)
+        if found is not None:
+            specimen, stretch = specimen.with_material(found.material), found.stretch
+        places = self._places(curves, specimen, stretch)
+        names = QUANTITIES[: len(places.wanted)]
         asked = {one.name for one in self.wanted}
         weight = np.array([weights.get(name, 1.0 if name in asked else 0.0) for name in names])
         inverse = np.linalg.inv(places.prior + self._information(places, curves))
@@ -126,11 +138,7 @@ class Learner:
         d, k = np.unravel_index(int(rate.argmax()), rate.shape)
         return Advice(Kind.GO, reason, float(places.h[k]), float(places.voltage[k]), HOLDS_S[d])
 
-    def _places(self, curves: Sequence[Curve], found: Identification | None) -> Places:
-        specimen = self._specimen
-        stretch = (FIRST_STRETCH * specimen.prestretch, specimen.prestretch)
-        if found is not None:
-            specimen, stretch = specimen.with_material(found.material), found.stretch
+    def _places(self, curves: Sequence[Curve], specimen: Specimen, stretch: tuple[float, float]) -> Places:
         return Places(specimen, self.h, self.voltage, self.scene.rates["force"], curves[0], stretch)
 
     def _information(self, places: Places, curves: Sequence[Curve]) -> Array:

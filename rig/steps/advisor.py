@@ -75,12 +75,18 @@ class Advice:
 
     def as_fields(self) -> dict[str, str | float]:
         """As ``/decision`` of the log has it."""
-        return {there: getattr(self, here) for here, there in _FIELDS.items()} | {"outcome": str(self.kind)}
+        told = {there: getattr(self, here) for here, there in _FIELDS.items()}
+        return told | {"outcome": str(self.kind), "unit": self.unit}
 
     @classmethod
     def from_fields(cls, fields: Mapping[str, Any]) -> Advice:
         """What a row of ``/decision`` says."""
         return cls(Kind(fields["outcome"]), **{here: fields[there] for here, there in _FIELDS.items()})
+
+    @property
+    def unit(self) -> str:
+        """Of the quantity; empty before there is one."""
+        return {"": "", "eps_r": "1"}.get(self.quantity, "Pa")
 
     @property
     def standing(self) -> str:
@@ -100,7 +106,7 @@ _FIELDS = {
     "value": "value",
     "standard_uncertainty": "standard_uncertainty",
     "relative": "relative_uncertainty",
-    "wanted": "wanted",
+    "wanted": "wanted_uncertainty",
     "expected_s": "expected_s",
 }
 

@@ -234,7 +234,7 @@ class _Loop:
                 advice.quantity,
                 advice.value,
                 advice.standard_uncertainty,
-                "1" if advice.quantity == "eps_r" else "Pa",
+                advice.unit,
             )
 
     def _go(self, advice: Advice) -> Turns:

@@ -79,12 +79,12 @@ def test_text_that_is_not_utf8_is_refused():
 
 
 def test_units_stand_in_the_names():
-    """Every double says its unit, but for references and results, which carry it in a field of their own, and the
-    reading of a force sensor, whose unit is the sensor's and stands in the metadata ``units``."""
+    """Every double says its unit, but for references, results and decisions, which carry it in a field of their own,
+    and the reading of a force sensor, whose unit is the sensor's and stands in the metadata ``units``."""
     units = ("_s", "_m", "_N", "_V", "_A", "_J", "_K", "_N_per_V2", "relative_humidity")  # the last one has none
     for topic, channel in schema.CHANNELS.items():
         for field in channel.fields:
-            own = topic in ("/reference", "/result") or (topic, field.name) == ("/force/sample", "reading")
+            own = topic in ("/reference", "/result", "/decision") or (topic, field.name) == ("/force/sample", "reading")
             if field.type == "double" and not own:
                 assert field.name.endswith(units), f"{topic}.{field.name}"
 
