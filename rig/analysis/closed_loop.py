@@ -11,11 +11,12 @@ import numpy as np
 
 from calibration.film.curve import Curve
 from calibration.film.identifiability import expected
-from calibration.film.planning import Places, one_term
+from calibration.film.planning import Places
 from calibration.film.propagation import Statement
 from calibration.rounding import percent
 from calibration.sensors.certificate import Certificate
 from rig.analysis.film import errors_of
+from rig.analysis.learning import believed_film
 from rig.analysis.proposal import framed, protocol_text, recorded, uniform_sweep
 from rig.base.errors import ConfigError
 from rig.protocol.experiment import certificates_of
@@ -86,10 +87,7 @@ def outlooks(
     scene: Scene, certificates: Mapping[str, Certificate], wanted: Sequence[Wanted], at_most_s: float, terms: int
 ) -> list[Outlook]:
     """What is expected of each wish with the scene's film; time of holding at the best places, ways counted roughly."""
-    specimen = scene.specimen.specimen()
-    lp = specimen.prestretch
-    if terms == 1 and specimen.material.terms > 1:
-        specimen = specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
+    specimen = believed_film(scene.specimen.specimen(), terms)
     grid = connected(scene, specimen)
     top_v = max(grid)
     sweep = uniform_sweep(scene, certificates, 600.0, grid[top_v][-1], top_v)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.curve import Curve
-from calibration.film.planning import Places
+from calibration.film.planning import Places, one_term
 from calibration.film.result import Identification, Quantity
 from model.specimen import Specimen
 from rig.scene.scene import Scene
@@ -97,7 +97,7 @@ class Learner:
 
     def standing(self, curves: Sequence[Curve], fit: Identification) -> dict[str, tuple[float, float]]:
         """By name of what is wanted: relative standard uncertainty, and what of it no time makes smaller."""
-        believed = self._places(curves, self._specimen, fit.stretch)
+        believed = self._places(curves, believed_film(self._specimen, fit.terms), fit.stretch)
         inverse = np.linalg.inv(believed.prior + self._information(believed, curves))
         least = np.sqrt(np.einsum("jp,pq,jq->j", believed.wanted, inverse, believed.wanted)).tolist()
         found = {}
@@ -159,6 +159,14 @@ class Learner:
         change = np.abs(places.voltage - question.voltage)
         way: Array = np.abs(places.h - question.h) / self.speed + change / ramp + self.settle_s * (change > 0.0)
         return way
+
+
+def believed_film(specimen: Specimen, terms: int) -> Specimen:
+    """The specimen with its film as it is believed, of one term where one is fitted."""
+    if terms > 1 or specimen.material.terms < 2:
+        return specimen
+    lp = specimen.prestretch
+    return specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
 
 
 def _about(wanted: Wanted, quantity: Quantity, relative: float) -> dict[str, float | str]:

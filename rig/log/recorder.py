@@ -217,7 +217,7 @@ class Recorder:
 
     def decision(self, fields: Mapping[str, object]) -> None:
         """Write what a closed loop does next, and why."""
-        self._write("/decision", self._clock.now(), **fields)
+        self._write("/decision", self._clock.now(), about=None, **fields)
 
     def cycle(self, fields: Mapping[str, object]) -> None:
         """Write the summary of a cycle that has ended."""

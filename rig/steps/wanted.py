@@ -13,8 +13,8 @@ LOWEST, HIGHEST = 1e-5, 0.5  # relative; beyond it nothing is meant
 EXAMPLE = '"eps_r 0.5 %", or several with commas: "eps_r 0.5 %, stiffness 1 %"'
 # Entries of a budget: what is stated of specimen and instruments, and what more time of the rig makes smaller.
 DIMENSIONS = ("thickness", "pre-stretch", "disk radius", "ring radius")
-STATED = ("force gain", "displacement gain", "displacement axis", "voltage gain", "voltage at the film")
-STATED += (*DIMENSIONS, "eccentricity")
+GAINS = ("force gain", "displacement gain", "displacement axis", "voltage gain", "voltage at the film")
+STATED = (*GAINS, *DIMENSIONS, "eccentricity")
 BY_TIME = ("noise", "force zero", "displacement zero", "lag", "compliance", "range of exponents", "other solutions")
 
 
