@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,19 +81,23 @@ class Learner:
             worst = lost[0]
             part, size = _largest(found.quantities[worst.name], worst)
             reason = f"{worst} cannot be reached by more time: {part} alone leaves {100 * size:.3g} %"
-            return Advice(
-                Kind.UNREACHABLE, reason, **_about(worst, found.quantities[worst.name], stands[worst.name][0])
-            )
+            told = _about(worst, found.quantities[worst.name], stands[worst.name][0])
+            return replace(told, kind=Kind.UNREACHABLE, reason=reason)
         if self._met > 1:
-            return Advice(Kind.MET, "known well enough, and so said the fit before", **told)
+            return replace(told, kind=Kind.MET, reason="known well enough, and so said the fit before")
         if question.left_s <= TURN_S:
-            return Advice(Kind.TIME, "the time is out", **told)
+            return replace(told, kind=Kind.TIME, reason="the time is out")
         weights = {one.name: 1.0 if one in missing else LITTLE for one in self.wanted}
         reason = "tells most per second" if missing else "known well enough; confirmed by new data"
-        chosen = self._next(curves, found, question, weights, reason)
-        hold = CONFIRM_S if not missing else chosen.hold_s
-        left = max((_time_left(stands[one.name], one, question.spent_s) for one in missing), default=0.0)
-        return Advice(Kind.GO, reason, chosen.h, chosen.voltage, hold, **told, expected_s=left)
+        next_one = self._next(curves, found, question, weights, reason)
+        return replace(
+            told,
+            reason=reason,
+            h=next_one.h,
+            voltage=next_one.voltage,
+            hold_s=next_one.hold_s if missing else CONFIRM_S,
+            expected_s=max((_time_left(stands[one.name], one, question.spent_s) for one in missing), default=0.0),
+        )
 
     def standing(self, curves: Sequence[Curve], fit: Identification) -> dict[str, tuple[float, float]]:
         """By name of what is wanted: relative standard uncertainty, and what of it no time makes smaller."""
@@ -169,15 +173,17 @@ def believed_film(specimen: Specimen, terms: int) -> Specimen:
     return specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
 
 
-def _about(wanted: Wanted, quantity: Quantity, relative: float) -> dict[str, float | str]:
-    """The fields of an advice that say how well a quantity is known."""
-    return {
-        "quantity": wanted.name,
-        "value": quantity.value,
-        "standard_uncertainty": relative * abs(quantity.value),
-        "relative": relative,
-        "wanted": wanted.relative,
-    }
+def _about(wanted: Wanted, quantity: Quantity, relative: float) -> Advice:
+    """An advice that says how well a quantity is known, and so far nothing else."""
+    return Advice(
+        Kind.GO,
+        "",
+        quantity=wanted.name,
+        value=quantity.value,
+        standard_uncertainty=relative * abs(quantity.value),
+        relative=relative,
+        wanted=wanted.relative,
+    )
 
 
 def _largest(quantity: Quantity, wanted: Wanted) -> tuple[str, float]:

@@ -221,7 +221,7 @@ def full_after(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(part_file.os, "write", write)
 
 
-@pytest.mark.parametrize("limit", [11_500, 11_501, 13_777, 20_000])
+@pytest.mark.parametrize("limit", [13_000, 13_001, 15_277, 21_500])
 def test_a_full_disk_ends_the_log_for_good(tmp_path, monkeypatch, limit):
     path = tmp_path / "a.mcap"
     full_after(limit, monkeypatch)
