@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from model.arrays import Array
+from model.material.gent import Gent
 from model.material.materials import NAMED, Branch, Material
 from model.membrane.history import solve_histories
 from model.membrane.solve import Status
@@ -24,7 +26,7 @@ def drawn(random: np.random.Generator) -> tuple[Specimen, tuple[Array, Array, Ar
     prestretch = random.uniform(2.0, 3.5) if vhb else random.uniform(1.05, 1.5)
     count = int(random.integers(1, 4))
     branches = tuple(
-        Branch(math.exp(random.uniform(*np.log((0.02, 2.0)))), math.exp(random.uniform(*np.log((0.05, 300.0)))))
+        Branch(math.exp(random.uniform(*np.log((0.02, 2.0)))), math.exp(random.uniform(*np.log((0.05, 1000.0)))))
         for _ in range(count)
     )
     material = NAMED["parker-cao2018"]
@@ -32,7 +34,9 @@ def drawn(random: np.random.Generator) -> tuple[Specimen, tuple[Array, Array, Ar
         material = Material("vhb", (43560.0, 117.4), (1.445, 4.248), 4.7)
     elif random.random() < 0.5:
         material = Material("one", (random.uniform(3e4, 1e5),), (random.uniform(1.5, 6.0),), random.uniform(1.5, 4.0))
-    material = Material(material.name, material.mu, material.alpha, material.eps_r, branches=branches)
+    elif random.random() < 0.5:
+        material = Material("gent", (random.uniform(3e4, 1e5),), (random.uniform(30.0, 120.0),), 2.5, law=Gent)
+    material = replace(material, branches=branches)
     thickness = 500e-6 if vhb else random.uniform(30e-6, 120e-6)
     specimen = Specimen(random.uniform(2e-3, 9e-3), 20e-3, thickness, prestretch, material)
     parts = int(random.integers(2, 6))
@@ -42,13 +46,17 @@ def drawn(random: np.random.Generator) -> tuple[Specimen, tuple[Array, Array, Ar
         t.append(t[-1] + math.exp(random.uniform(*np.log((0.2, 60.0)))))
         h.append(h[-1] if k and random.random() < 0.4 else random.uniform(1e-3, 14e-3))
         voltage.append(voltage[-1] if random.random() < 0.6 else random.uniform(0.0, scale))
-    times = np.sort(np.concatenate((t[1:], random.uniform(0.0, t[-1], 3))))
+    if random.random() < 0.2:  # a hold of no length
+        bend = int(random.integers(1, len(t)))
+        for one in (t, h, voltage):
+            one.insert(bend, one[bend])
+    times = np.sort(np.concatenate((t, random.uniform(0.0, t[-1], 3))))  # some of them twice
     return specimen, (np.array(t), np.array(h), np.array(voltage)), times
 
 
 def simulated(specimen: Specimen, course: tuple[Array, Array, Array], times: Array, fine: float) -> Array:
     """Force of the simulated bench's film at ``times``: steps grow after every bend, by a share ``fine`` of the way."""
-    t, h, voltage = course
+    t, h, voltage = (one[np.concatenate((np.diff(course[0]) > 0.0, [True]))] for one in course)
     film = ViscousFilm(specimen, [(one.ratio, one.time) for one in specimen.material.branches], 0.0)
     stops = np.unique(np.concatenate((t, times)))
     moment, found = film.rested, {0.0: 0.0}
