@@ -132,27 +132,26 @@ FEBIO: Forms = {
 }
 
 
-def abaqus(material: Material, law: Constants) -> str:
+def abaqus(material: Material, law: Constants, electric: bool) -> str:
     """Keywords for an input file; 8 numbers a line, D = 0 for an incompressible film (hybrid or membrane elements)."""
     volumetric = {Ogden: len(material.mu), Yeoh: 3}.get(material.law, 1)
     values = [value for _, value in law.values] + [0.0] * volumetric
     lines = [", ".join(_number(value) for value in values[k : k + 8]) for k in range(0, len(values), 8)]
     return "\n".join(
         [
-            *(f"** {line}" for line in _head(material, law)),
+            *(f"** {line}" for line in _head(material, law, electric)),
             f"*MATERIAL, NAME={_name(material)}",
             f"*HYPERELASTIC, {law.key}" + (", MODULI=LONG TERM" if material.branches else ""),
             *lines,
             *(["*VISCOELASTIC, TIME=PRONY"] if material.branches else []),
             *(f"{_number(g)}, 0., {_number(tau)}" for g, tau in over_instant(material)),
-            "*DIELECTRIC",
-            _number(EPSILON_0 * material.eps_r),
+            *(["*DIELECTRIC", _number(EPSILON_0 * material.eps_r)] if electric else []),
             "",
         ]
     )
 
 
-def ansys(material: Material, law: Constants) -> str:
+def ansys(material: Material, law: Constants, electric: bool) -> str:
     """Commands (APDL); d = 0 for an incompressible film."""
     volumetric = {Ogden: len(material.mu), Yeoh: 3}.get(material.law, 1)
     values = [value for _, value in law.values] + [0.0] * volumetric
@@ -162,20 +161,20 @@ def ansys(material: Material, law: Constants) -> str:
     ]
     return "\n".join(
         [
-            *(f"! {line}" for line in _head(material, law)),
+            *(f"! {line}" for line in _head(material, law, electric)),
             f"TB,HYPER,1,1,{law.key}",
             *lines,
             *([f"TB,PRONY,1,1,{len(material.branches)},SHEAR"] if material.branches else []),
             *(f"TBDATA,{2 * k + 1},{_number(a)},{_number(tau)}" for k, (a, tau) in enumerate(over_instant(material))),
-            f"MP,PERX,1,{_number(material.eps_r)}",
+            *([f"MP,PERX,1,{_number(material.eps_r)}"] if electric else []),
             "",
         ]
     )
 
 
-def comsol(material: Material, law: Constants) -> str:
+def comsol(material: Material, law: Constants, electric: bool) -> str:
     """Parameters to load under Global Definitions, and the material model that they belong to."""
-    lines = [f"% {line}" for line in _head(material, law)]
+    lines = [f"% {line}" for line in _head(material, law, electric)]
     lines.append(f"% Hyperelastic Material, {law.key}, nearly incompressible or incompressible: constants as below.")
     for name, value in law.values:
         unit = "" if name in law.unit_less else "[Pa]"
@@ -183,11 +182,11 @@ def comsol(material: Material, law: Constants) -> str:
     for k, (factor, tau) in enumerate(over_relaxed(material), start=1):
         lines.append(f'beta_v{k} {_number(factor)} "energy factor of branch {k} of the generalized Maxwell model"')
         lines.append(f'tau_v{k} {_number(tau)}[s] "relaxation time of branch {k}"')
-    lines += [f'epsilonr {_number(material.eps_r)} "relative permittivity"', ""]
-    return "\n".join(lines)
+    lines += [f'epsilonr {_number(material.eps_r)} "relative permittivity"'] if electric else []
+    return "\n".join([*lines, ""])
 
 
-def febio(material: Material, law: Constants) -> str:
+def febio(material: Material, law: Constants, electric: bool) -> str:
     """A material of a model file (uncoupled)."""
     elastic = [
         *(f"  <{name}>{_number(value)}</{name}>" for name, value in law.values),
@@ -209,7 +208,7 @@ def febio(material: Material, law: Constants) -> str:
     return "\n".join(
         [
             "<!--",
-            *(line.replace("--", "- -") for line in _head(material, law)),
+            *(line.replace("--", "- -") for line in _head(material, law, electric)),
             "FEBio has no permittivity in this material.",
             "-->",
             *body,
@@ -226,7 +225,7 @@ class Program:
     name: str
     file: str
     forms: Forms
-    write: Callable[[Material, Constants], str]
+    write: Callable[[Material, Constants, bool], str]
     branches: str  # its convention of a Prony series
     instant: bool = False  # whether it asks for the moduli that the film has at once
 
@@ -250,8 +249,10 @@ PROGRAMS = (
 )
 
 
-def material_cards(material: Material) -> dict[str, str]:
+def material_cards(material: Material, *, electric: bool = True) -> dict[str, str]:
     """Text of the card of every program that has the material's law, by file name; the others: `without_card`.
+
+    Without ``electric`` there is no permittivity in them, for tests of a sheet do not tell it.
 
     Raises
     ------
@@ -261,15 +262,15 @@ def material_cards(material: Material) -> dict[str, str]:
     able = [one for one in PROGRAMS if not one.missing(material)]
     if not able:
         raise CardError(f"there is no material card for this film: {'; '.join(without_card(material))}")
-    return {one.file: _card(one, material) for one in able}
+    return {one.file: _card(one, material, electric) for one in able}
 
 
-def _card(program: Program, material: Material) -> str:
+def _card(program: Program, material: Material, electric: bool) -> str:
     own = at_once(material) if material.branches and program.instant else material
     law = program.forms[material.law](own)
     if material.branches:
         law = replace(law, energy=f"{law.energy}; branches: {program.branches}")
-    return program.write(own, law)
+    return program.write(own, law, electric)
 
 
 def without_card(material: Material) -> list[str]:
@@ -277,7 +278,7 @@ def without_card(material: Material) -> list[str]:
     return [why for one in PROGRAMS if (why := one.missing(material))]
 
 
-def _head(material: Material, law: Constants) -> list[str]:
+def _head(material: Material, law: Constants, electric: bool) -> list[str]:
     own = f"{OURS}, G = 1/2 sum mu_n alpha_n" if material.law is Ogden else material.law.description.split(". ")[0]
     times = (
         ["Its branches rest in the undeformed film here: stretch it first and let it rest, as the rig does."]
@@ -285,11 +286,12 @@ def _head(material: Material, law: Constants) -> list[str]:
         else []
     )
     return [
-        "Film identified by dea-rig, in Pa and m. Its density is not known; add it.",
+        f"{'Film' if electric else 'Sheet'} identified by dea-rig, in Pa and m. Its density is not known; add it.",
         *times,
         f"Convention of this card: {law.energy}",
         f"Convention of dea-rig: {own}",
-        f"Small-strain shear modulus {_number(material.shear_modulus)} Pa, relative permittivity {material.eps_r:.6g}",
+        f"Small-strain shear modulus {_number(material.shear_modulus)} Pa, "
+        + (f"relative permittivity {material.eps_r:.6g}" if electric else "permittivity not known: add it"),
     ]
 
 

@@ -35,7 +35,7 @@ from calibration.film.minima import (
     spread,
     starting_materials,
 )
-from calibration.film.problem import NODES, IdentificationError, Problem
+from calibration.film.problem import NODES, IdentificationError, Problem, UnknownParameter
 from calibration.film.propagation import secant_modulus
 from calibration.film.reduction import Selection, select
 from calibration.film.result import Identification
@@ -122,7 +122,7 @@ def identify(
     allowed = [*law.names(moduli, shapes)[moduli:], "eps_r"]
     unknown = [name for name in held if name not in allowed]
     if unknown:
-        raise IdentificationError(f"cannot fix {', '.join(unknown)}; what can be fixed is {', '.join(allowed)}")
+        raise UnknownParameter(f"cannot fix {', '.join(unknown)}; what can be fixed is {', '.join(allowed)}")
     if terms < 1 or starts < 1:
         raise IdentificationError("terms and starts must be at least 1")
     choice = fittable()

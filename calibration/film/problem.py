@@ -40,6 +40,10 @@ class IdentificationError(ValueError):
     """Curves from which nothing can be identified; the message says why."""
 
 
+class UnknownParameter(IdentificationError):
+    """A parameter that is to be fixed and that the film does not have."""
+
+
 @dataclass(frozen=True)
 class Nuisance:
     """An error that is fitted along: what kind, of which run, its prior standard uncertainty, which rows.

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.sheet.sheet_tests import HomogeneousTest, TestsError, first_seen
+from calibration.sheet.sheet_tests import HomogeneousTest, TestsError, UnknownParameter, first_seen
 from model.material.law import Law, stack
 from model.material.neo_hooke import NeoHooke
 from model.material.ogden import Ogden
@@ -98,7 +98,7 @@ class SheetProblem:
             known = (
                 f"what can be fixed is {', '.join(shapes)}" if shapes else f"{self.law.title} has no shape parameter"
             )
-            raise TestsError(f"cannot fix {', '.join(unknown)}; {known}")
+            raise UnknownParameter(f"cannot fix {', '.join(unknown)}; {known}")
         sides = [parameter.search for parameter in self.law.parameters(self.moduli, self.shapes)][self.moduli :]
         for name, side in zip(shapes, sides, strict=True):
             low, high = EXPONENT_BOUNDS if self.law is Ogden else side

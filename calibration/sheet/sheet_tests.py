@@ -27,6 +27,12 @@ class TestsError(ValueError):
     __test__ = False  # not a test class, whatever its name suggests to pytest
 
 
+class UnknownParameter(TestsError):
+    """A parameter that is to be fixed and that the law does not have."""
+
+    __test__ = False
+
+
 @dataclass(frozen=True, eq=False)
 class TestHistory:
     """All rows of a test with their times (s), whatever branch of it is fitted as elastic."""

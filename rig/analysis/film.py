@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,11 +18,12 @@ from calibration.film.between import Spread, between, by_specimen, identify_each
 from calibration.film.cards import CardError, material_cards
 from calibration.film.curve import Curve, CurveError
 from calibration.film.identify import IdentificationError, compare, identify
+from calibration.film.problem import UnknownParameter
 from calibration.film.result import Identification
 from calibration.film.summary import looks_viscous
 from calibration.sensors.certificate import Certificate
 from model.material.law import Law
-from model.material.laws import find_law
+from model.material.laws import find_law, known_laws
 from model.material.materials import Material
 from rig.base.errors import ConfigError, DataError
 from rig.base.outputs import write_text
@@ -220,6 +222,8 @@ def identify_curves(
             from calibration.film.posterior import posterior as sample
 
             identification = replace(identification, posterior=sample(curves, identification, progress=progress))
+    except UnknownParameter as error:
+        raise ConfigError(f"--fix: {error}.") from None
     except (CurveError, IdentificationError) as error:
         raise DataError(f"{error}.") from None
     found = Found(identification, curves, [], provenance, None, [], comparison)
@@ -272,11 +276,13 @@ def _between(curves: list[Curve], terms: int, options: Mapping[str, Any]) -> dic
 
 
 def law_called(name: str) -> type[Law]:
-    """The law of that name. Raises `DataError` when there is none."""
+    """The law of that name, with dashes or blanks for its underscores. Raises `ConfigError` when there is none."""
+    plain = name.strip().casefold().replace("-", "_").replace(" ", "_")
     try:
-        return find_law(name)
+        return find_law(plain)
     except ValueError as error:
-        raise DataError(f"{error}.") from None
+        near = get_close_matches(plain, known_laws(), n=1, cutoff=0.5)
+        raise ConfigError(f"--law {name!r}: {error}." + (f" Did you mean {near[0]}?" if near else "")) from None
 
 
 def _check_one_kind(benches: Mapping[str, str]) -> None:
@@ -423,7 +429,7 @@ def _as_json(found: Found) -> str:
     return json.dumps(values, indent=2, allow_nan=False) + "\n"
 
 
-def write_cards(found: Identification, folder: Path) -> list[Path]:
+def write_cards(material: Material, folder: Path, *, electric: bool = True) -> list[Path]:
     """Write the material cards of every program that knows the law into ``folder``, which is made if need be.
 
     Raises
@@ -434,7 +440,7 @@ def write_cards(found: Identification, folder: Path) -> list[Path]:
         When no program has the law.
     """
     try:
-        cards = material_cards(found.material)
+        cards = material_cards(material, electric=electric)
     except CardError as error:
         raise DataError(f"{error}.") from None
     try:

@@ -10,13 +10,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from calibration.film.cards import without_card
 from calibration.film.curve import CurveError
 from calibration.sheet.fit import Compared, TestsFit, compare_laws, fit_tests
 from calibration.sheet.problem import Weighting
-from calibration.sheet.sheet_tests import HomogeneousTest, TestsError
+from calibration.sheet.sheet_tests import HomogeneousTest, TestsError, UnknownParameter
 from calibration.sheet.timed.record import stress_fallen
 from model.material.laws import known_laws
-from rig.analysis.film import UNKNOWN_LAG, Found, dimension_errors, identify_curves, law_called
+from model.material.materials import Material
+from rig.analysis.film import UNKNOWN_LAG, Found, dimension_errors, identify_curves, law_called, write_cards
 from rig.base.errors import ConfigError, DataError
 from rig.base.table import Table
 from rig.base.text_file import read_text
@@ -135,6 +137,8 @@ def identify_sheets(read: SheetsRead, *, law: str = "ogden", **options: Any) -> 
     """
     try:
         found = fit_tests(read.tests, predict=read.predict, law=law_called(law), **options)
+    except UnknownParameter as error:
+        raise ConfigError(f"--fix: {error}.") from None
     except TestsError as error:
         raise DataError(f"{error}.") from None
     for test in read.tests:
@@ -161,3 +165,19 @@ def sheets_record(paths: Sequence[Path], predict: Sequence[Path], settings: Mapp
 def compare_sheets(read: SheetsRead, weighting: Weighting) -> list[Compared]:
     """Every known law on the tests that were read."""
     return compare_laws(read.tests, list(known_laws().values()), weighting=weighting)
+
+
+def sheet_cards(found: TestsFit, folder: Path) -> tuple[list[Path], list[str]]:
+    """Write the material cards of a sheet into ``folder``, without a permittivity, which its tests do not tell.
+
+    Returns the files, and the programs that have no card for its law and why.
+
+    Raises
+    ------
+    ConfigError
+        When a file cannot be written, or is there already.
+    DataError
+        When no program has the law.
+    """
+    sheet = Material("sheet", found.mu, found.alpha, 1.0, law=found.law)  # its eps_r is in no card
+    return write_cards(sheet, folder, electric=False), without_card(sheet)

@@ -145,7 +145,7 @@ def command(
         else:
             found = identify_logs(list(logs), **settings)
     write_results(found, out, report)
-    written = [] if cards is None else write_cards(found.identification, cards)
+    written = [] if cards is None else write_cards(found.identification.material, cards)
     without = [] if cards is None else without_card(found.identification.material)
     parts = [comparison_table(found.comparison)] if comparing else []
     parts += [posterior_table(found.identification)] if posterior else []

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rig.cli.files import FILE, tell_written
+from rig.cli.files import FILE, FOLDER, tell_written
 from rig.cli.fit_options import branches_wanted, fix_option, fixed_values
 from rig.cli.import_options import import_options, taken, understood_or_refused, with_import
 
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 @click.option("--film", type=FILE, help="Result of dea-rig fit -o: predict the TESTS from that film; no fit of them.")
 @click.option("--compare", "comparing", is_flag=True, help="Judge all laws: AICc, prediction of the other modes.")
 @click.option("--predict", multiple=True, type=FILE, help="A test that takes no part and is predicted.")
+@click.option("--cards", type=FOLDER, help="Folder for material cards of Abaqus, Ansys, COMSOL and FEBio.")
 @import_options(sheet=True)
 def command(
     tests: tuple[Path, ...],
@@ -72,6 +73,7 @@ def command(
     film: Path | None,
     comparing: bool,
     predict: tuple[Path, ...],
+    cards: Path | None,
     dry_run: bool,
     tidy: Path | None,
     **words: Any,
@@ -86,7 +88,7 @@ def command(
     With --branches all rows of relaxation and cyclic tests are fitted over time. --cone predicts the force of a cone
     from the sheet, --film the sheet from a cone.
     """
-    from rig.analysis.imported import compare_sheets, identify_sheets, read_sheets, sheets_record
+    from rig.analysis.imported import compare_sheets, identify_sheets, read_sheets, sheet_cards, sheets_record
     from rig.base.outputs import check_new, write_text
     from rig.cli.show import show
 
@@ -96,6 +98,8 @@ def command(
         raise click.UsageError("--cone goes with --branches: give --branches auto.")
     if film is not None and (number or cones or comparing or predict):
         raise click.UsageError("--film goes without --branches, --cone, --compare and --predict: it fits nothing.")
+    if cards is not None and (number or film is not None):
+        raise click.UsageError("--cards goes without --branches and --film: the cards are of the elastic law.")
     read = understood_or_refused(lambda: read_sheets(tests, predict, taken(words)))
     if tidy is not None:
         from rig.importing.tidy import write_sheet_tests
@@ -136,8 +140,10 @@ def command(
 
         told = [line for one in read.understood for line in one.lines()]
         write_report(report, found, [*read.tests, *read.predict], compared, told)
-    show(tests_table(found), *([compared_table(compared)] if compared else []))
-    tell_written(out, report, tidy)
+    written, without = ([], []) if cards is None else sheet_cards(found, cards)
+    compared_tables = [compared_table(compared)] if compared else []
+    show(tests_table(found), *compared_tables, *(f"note: {why}" for why in without))
+    tell_written(out, report, tidy, *written)
 
 
 def compared_table(compared: Sequence[Compared]) -> Table:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.importing.findings import Findings
+from rig.importing.findings import Findings, spans
 from rig.importing.headings import DIMENSION, Heading, fold
 from rig.importing.numbers import clock_values, column_values
 from rig.importing.options import ImportOptions
@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 ONE = Unit("1", "ratio", 1.0)
 SECOND = Unit("s", "time", 1.0)
+MOST_SPANS = 12  # of lines in an option that is to be copied
 EXAMPLE = {
     "stress": "MPa",
     "force": "N",
@@ -109,7 +110,7 @@ class Chooser:
             self.findings.obstacle(
                 "columns",
                 f"{len(equal)} columns can be the {quantity}: {', '.join(self._title(j) for j in equal)}",
-                " or ".join(f"--column {quantity}={j + 1}" for j in equal),
+                " or ".join(f"--column {quantity.replace(' ', '-')}={j + 1}" for j in equal),
                 line=self.table.heading_line,
             )
         elif len(found) > 1:
@@ -117,9 +118,20 @@ class Chooser:
                 "columns",
                 f"{self._title(found[0])} is taken as {quantity}, not {', '.join(map(self._title, found[1:]))}: "
                 "what is measured at the specimen goes before what is set or measured at the drive",
-                f"--column {quantity}={found[1] + 1}",
+                f"--column {quantity.replace(' ', '-')}={found[1] + 1}",
             )
+        self._against_heading(quantity, found[0])
         return self._with_unit(quantity, found[0])
+
+    def _against_heading(self, quantity: str, index: int) -> None:
+        """Tell where an option takes a column for what its heading does not say, in the same kind of unit."""
+        said, taken = self.table.headings[index].quantity, quantity.rstrip("12")
+        if said != taken and DIMENSION.get(said) == DIMENSION[taken]:
+            self.findings.warning(
+                "columns",
+                f"{self._title(index)} is taken as {taken}, as asked, and its heading reads as {said}",
+                f"--column {said.replace(' ', '-')}={index + 1}",
+            )
 
     def _with_unit(self, quantity: str, index: int) -> Chosen | None:
         heading = self.table.headings[index]
@@ -210,13 +222,20 @@ def groups_of(table: RawTable) -> tuple[list[list[int]], list[str]]:
     """Columns of each specimen where several stand side by side, with their labels; else one group of all columns.
 
     Side by side means that the headings, without the specimen's number, are one sequence of two or more names that is
-    repeated; a first column of time may be shared.
+    repeated; a first column of time may be shared. Where headings name voltages, the columns of one voltage stand with
+    all that name none.
     """
     used = [j for j in range(table.width) if table.headings[j].text or table.numeric[j]]
-    for shared in (0, 1):
-        if shared and (not used or table.headings[used[0]].quantity not in ("time", "index")):
+    voltages = {table.headings[j].at_voltage: None for j in used}  # in the order of the columns
+    if len(voltages) > 1 + (None in voltages):
+        shared = [j for j in used if table.headings[j].at_voltage is None]
+        voltages.pop(None, None)
+        groups = [shared + [j for j in used if table.headings[j].at_voltage == one] for one in voltages]
+        return groups, [f"{one:g} V" for one in voltages]
+    for first in (0, 1):
+        if first and (not used or table.headings[used[0]].quantity not in ("time", "index")):
             continue
-        rest = used[shared:]
+        rest = used[first:]
         for period in range(2, len(rest) // 2 + 1):
             names = [_base(table.headings[j].text) for j in rest]
             if len(rest) % period or names != names[:period] * (len(rest) // period) or "" in names:
@@ -227,7 +246,7 @@ def groups_of(table: RawTable) -> tuple[list[list[int]], list[str]]:
             labels = [
                 next((table.labels[j] for j in group if table.labels and table.labels[j]), "") for group in groups
             ]
-            return [used[:shared] + group for group in groups], labels
+            return [used[:first] + group for group in groups], labels
     return [used], [""]
 
 
@@ -266,58 +285,67 @@ def read_columns(
     lines = np.array([section.lines[k] for k in keep], dtype=np.intp)
     whole = np.ones(lines.size, dtype=np.bool_)
     values: dict[str, Array] = {}
+    wrong: dict[int, list[Chosen]] = {}  # by row
     for one in chosen:
         cells = [section.rows[k][one.index] for k in keep]
-        column = _converted(one, cells, lines, table, findings)
-        if column is None:
+        column, bad = _converted(one, cells, table)
+        for row in bad:
+            wrong.setdefault(row, []).append(one)
+        if column is None or bad:
             continue
         whole &= np.isfinite(column) | (one.quantity == "time")
         first = column[np.isfinite(column)][:1]
         zero = (float(first[0]) if first.size else 0.0) if one.zero is None else one.zero
         values[one.quantity] = (column - zero) * one.factor if zero else column * one.factor
+    _report_wrong(wrong, [section.rows[k] for k in keep], lines, findings)
     inside = np.flatnonzero(whole)
     last = int(inside[-1]) if inside.size else -1
-    missing = [int(lines[k]) for k in range(last) if not whole[k]]
+    marked = [any(section.rows[keep[k]][one.index].strip() for one in chosen) for k in range(last + 1, lines.size)]
+    missing = [int(lines[k]) for k in range(lines.size) if not whole[k] and (k < last or marked[k - last - 1])]
     left_out += [LeftOut(line, "no value in a column that is used", table.text.lines[line - 1]) for line in missing]
     return Part(label, lines[whole], {name: column[whole] for name, column in values.items()}, section), left_out
 
 
-def _converted(
-    one: Chosen, cells: list[str], lines: NDArray[np.intp], table: RawTable, findings: Findings
-) -> Array | None:
+def _converted(one: Chosen, cells: list[str], table: RawTable) -> tuple[Array | None, list[int]]:
+    """A column in its own unit, nan where there is no value; and the rows whose cell is something else."""
     if one.quantity == "time":
         clock = clock_values([cell.strip() for cell in cells]) if cells and ":" in cells[0] else None
         if clock is not None:
-            return clock / one.unit.factor
+            return clock / one.unit.factor, []
         if not one.unit.name:
-            return None
-    column, bad = column_values([cell.strip() for cell in cells], table.dialect)
-    if bad:
-        last = " -> ".join(str(lines[k]) for k in {bad[0], bad[-1]})
+            return None, []
+    return column_values([cell.strip() for cell in cells], table.dialect)
+
+
+def _report_wrong(
+    wrong: dict[int, list[Chosen]], rows: Sequence[Sequence[str]], lines: NDArray[np.intp], findings: Findings
+) -> None:
+    """Cells that are no number, by column; the option is the same for all of them, for it leaves all these rows out."""
+    option = _rows_without(lines, sorted(wrong)) if wrong else ""
+    for one in {one.index: one for row in sorted(wrong) for one in wrong[row]}.values():
+        bad = [row for row in sorted(wrong) if one in wrong[row]]
+        more = f", here and in {len(bad) - 1} more rows (lines {spans([int(lines[k]) for k in bad])})"
         findings.obstacle(
             "cell",
-            f"{one.quantity} is no number"
-            + (f", here and in {len(bad) - 1} more rows (lines {last})" if len(bad) > 1 else ""),
-            _rows_without(lines, bad),
+            f"{one.quantity} is no number" + (more if len(bad) > 1 else ""),
+            option,
             line=int(lines[bad[0]]),
             column=one.index + 1,
-            cell=cells[bad[0]],
+            cell=rows[bad[0]][one.index],
         )
-        return None
-    return column
 
 
 def _rows_without(lines: NDArray[np.intp], bad: Sequence[int]) -> str:
-    """The option that leaves a few rows out."""
-    if len(bad) > 3:
+    """The option that leaves rows out."""
+    if len(bad) > MOST_SPANS:
         return "--rows FIRST-LAST leaves lines out"
-    spans, start = [], int(lines[0])
+    kept, start = [], int(lines[0])
     for k in bad:
         if int(lines[k]) > start:
-            spans.append(f"{start}-{int(lines[k]) - 1}")
+            kept.append(f"{start}-{int(lines[k]) - 1}")
         start = int(lines[k]) + 1
-    spans.append(f"{start}-")
-    return f"--rows {','.join(spans)}"
+    kept.append(f"{start}-")
+    return f"--rows {','.join(kept)}"
 
 
 def _is_cut(rows: Sequence[Sequence[str]], numeric: Sequence[bool]) -> bool:

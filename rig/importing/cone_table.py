@@ -11,23 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.curve import Curve
-from model.membrane.solve import solve
 from model.specimen import Specimen
-from rig.importing.branches import Leg, jumps_of, legs_of, noise_of, repeated_rows, steps_of
+from rig.importing.branches import Leg, legs_of, noise_of, repeated_rows
 from rig.importing.columns import Chooser, Chosen, Part, read_columns
-from rig.importing.findings import Finding, Findings, refuse
+from rig.importing.cone_checks import LEAST_VOLTAGE, usable
+from rig.importing.findings import Finding, refuse
 from rig.importing.options import ImportOptions
 from rig.importing.source import Piece, Source, open_source
+from rig.importing.stated_voltage import ask_for_other, said_of, shared_out
 from rig.importing.table import LeftOut
 from rig.importing.understood import Understood
 
 Array = NDArray[np.float64]
 
 WANTED = ("displacement", "force", "voltage")
-IMPLAUSIBLE = 20.0  # factor between the measured force and that of the cone as believed
-LEAST_VOLTAGE = 50.0  # V; less bends no film
-NO_REST = 0.1  # of the largest displacement or force: what begins at more does not begin at zero
-MOST_FIELD = 1e9  # V/m, of the undeformed film; elastomers break down at a tenth of it
 LEVEL_V, LEVEL_PART = 20.0, 0.02  # by which voltages of one level may differ
 ALLOWED_V, ALLOWED_PART = 50.0, 0.05  # by which a sample of a sweep may be off its level
 SWEEPS_DIFFER = 0.05  # of the largest force: sweeps at one voltage that differ by more are not of one state
@@ -56,6 +53,22 @@ class Sweep:
     voltage: float
 
 
+@dataclass
+class Run:
+    """A piece of a table that is displacement and force of this cone, with its ways out and back.
+
+    ``stated`` are the voltages (V) of the sweeps where they are said and not measured; ``part`` may then have no column
+    of them.
+    """
+
+    source: Source
+    piece: Piece
+    name: str
+    part: Part
+    pairs: list[list[Leg]]
+    stated: list[float] | None = None
+
+
 def read_cone_tables(paths: Sequence[Path], specimen: Specimen, options: ImportOptions | None = None) -> ConeTable:
     """Read force-displacement curves of a cone from tables of any layout.
 
@@ -69,18 +82,18 @@ def read_cone_tables(paths: Sequence[Path], specimen: Specimen, options: ImportO
     ImportRefused
         With every obstacle of every file, and the option that removes it.
     """
+    sources = [open_source(path, options or ImportOptions()) for path in paths]
+    runs = [run for source in sources for run in _runs_of(source, specimen)]
+    _share_out(runs)
     curves: list[Curve] = []
-    understood: list[Understood] = []
     tidy: list[dict[str, Array]] = []
-    findings: list[Finding] = []
-    for path in paths:
-        source = open_source(path, options or ImportOptions())
-        found, columns = _curves_of(source, specimen)
-        curves += found
-        tidy += columns
-        understood.append(source.understood)
-        findings += source.findings.all
+    for source in sources:
+        found = [_curves_of(run, specimen) for run in runs if run.source is source]
+        curves += [curve for ours, _ in found for curve in ours]
+        tidy += _together([columns for _, columns in found])
+    findings = [one for source in sources for one in source.findings.all]
     findings += _same_data(curves)
+    understood = [source.understood for source in sources]
     refuse(findings, [line for one in understood for line in one.lines()])
     return ConeTable(curves, understood, tidy)
 
@@ -94,39 +107,72 @@ def _same_data(curves: Sequence[Curve]) -> list[Finding]:
     return found
 
 
-def _curves_of(source: Source, specimen: Specimen) -> tuple[list[Curve], list[dict[str, Array]]]:
-    curves: list[Curve] = []
-    tidy: list[dict[str, Array]] = []
+def _runs_of(source: Source, specimen: Specimen) -> list[Run]:
+    """The pieces of one file, as far as they can be displacement and force of this cone."""
+    runs = []
     for number, piece in enumerate(source.pieces):
         part = _read(source, piece, first=number == 0)
         if part is None:
             continue
-        name = (
-            source.path.name
-            if len(source.pieces) == 1
-            else f"{source.path.name}, {piece.label or f'part {number + 1}'}"
-        )
+        name = source.path.name
+        if len(source.pieces) > 1:
+            name += f", {piece.label or f'part {number + 1}'}"
         part = _turned(part, source, first=number == 0)
-        if not _usable(name, part, source, specimen):
-            continue
-        sweeps = _sweeps(name, part, source)
-        noise = _noises(part)
-        found = [_curve(name, k, sweep, part, specimen, noise) for k, sweep in enumerate(sweeps)]
-        found = _with_known_voltage(name, found, part, sweeps, source)
-        used = (
-            np.sort(np.concatenate([sweep.rows for sweep, curve in zip(sweeps, found, strict=False)]))
-            if found
-            else np.zeros(0, np.intp)
-        )
-        tidy.append({quantity: column[used] for quantity, column in part.values.items()})
-        curves += found
-        source.understood.rows_kept.append(int(used.size))
-        spare = np.setdiff1d(np.arange(part.lines.size), used)
-        source.understood.leave_out(
-            [LeftOut(int(part.lines[k]), "at rest, or while the voltage changes", "") for k in spare]
-        )
-        source.understood.parts += [_described(curve) for curve in found]
-    return curves, tidy
+        if usable(name, part, source, specimen):
+            run = Run(source, piece, name, part, _pairs(name, part, source))
+            said = None if source.options.voltage or "voltage" in part.values else said_of(source, piece)
+            if said is not None:
+                run.stated = [said[0]] * len(run.pairs)
+                source.findings.note("voltage", f"{name}: {said[0]:g} V ({said[1]})", "--voltage 0,1000,1500")
+            runs.append(run)
+    return runs
+
+
+def _share_out(runs: Sequence[Run]) -> None:
+    """Give the voltages of the option to the sweeps: of each file where that comes out even, else of all of them."""
+    asked = [run for run in runs if run.source.options.voltage]
+    by_file = [
+        [run for run in asked if run.source is source] for source in {id(r.source): r.source for r in asked}.values()
+    ]
+    even = all(shared_out(own[0].source.options.voltage, [len(run.pairs) for run in own]) for own in by_file)
+    for own in by_file if even else [asked] if asked else []:
+        stated, counts = own[0].source.options.voltage, [len(run.pairs) for run in own]
+        shares = shared_out(stated, counts)
+        if shares is None:
+            ask_for_other(stated, counts, own[0].source.findings)
+        if 0.0 < max(map(abs, stated)) < LEAST_VOLTAGE:
+            own[0].source.findings.warning(
+                "voltage",
+                f"the highest voltage stated is {max(map(abs, stated)):g} V, which bends no film",
+                "--voltage in V, not kV",
+            )
+        for run, share in zip(own, shares or [[] for _ in own], strict=True):
+            run.stated = share
+
+
+def _together(tables: Sequence[dict[str, Array]]) -> list[dict[str, Array]]:
+    """The columns of the runs of one file, one below the other; time that begins again is left out."""
+    if len(tables) <= 1:
+        return list(tables)
+    names = [name for name in tables[0] if name != "time" and all(name in table for table in tables)]
+    return [{name: np.concatenate([table[name] for table in tables]) for name in names}]
+
+
+def _curves_of(run: Run, specimen: Specimen) -> tuple[list[Curve], dict[str, Array]]:
+    source, part = run.source, run.part
+    sweeps = _sweeps(run)
+    noise = _noises(part)
+    found = [_curve(run.name, k, sweep, part, specimen, noise) for k, sweep in enumerate(sweeps)]
+    found = _with_known_voltage(run, found)
+    rows = [sweep.rows for sweep, _ in zip(sweeps, found, strict=False)]
+    used = np.sort(np.concatenate(rows)) if rows else np.zeros(0, np.intp)
+    source.understood.rows_kept.append(int(used.size))
+    spare = np.setdiff1d(np.arange(part.lines.size), used)
+    source.understood.leave_out(
+        [LeftOut(int(part.lines[k]), "at rest, or while the voltage changes", "") for k in spare]
+    )
+    source.understood.parts += [_described(curve) for curve in found]
+    return found, {quantity: column[used] for quantity, column in part.values.items()}
 
 
 def _described(curve: Curve) -> str:
@@ -151,9 +197,9 @@ def _read(source: Source, piece: Piece, *, first: bool) -> Part | None:
         one = chooser.choose(quantity)
         if one is not None:
             chosen.append(one)
-        elif quantity == "voltage" and source.options.voltage and not chooser.candidates(quantity):
-            continue
-        elif not chooser.candidates(quantity):
+        elif not chooser.candidates(quantity) and not (
+            quantity == "voltage" and (source.options.voltage or said_of(source, piece))
+        ):
             _ask(quantity, chooser)
     time = chooser.choose("time") if chooser.candidates("time") else None
     if time is not None:
@@ -174,10 +220,7 @@ def _read(source: Source, piece: Piece, *, first: bool) -> Part | None:
         values["time"] = (
             _rising(values["time"], part, source) if np.isfinite(values["time"]).all() else values.pop("time")
         )
-    if "voltage" not in values:
-        values["voltage"] = np.zeros(part.lines.size)
-    if first:
-        source.understood.take(chosen)
+    source.understood.take(chosen)
     return replace(part, values=values)
 
 
@@ -231,7 +274,7 @@ def _turned(part: Part, source: Source, *, first: bool) -> Part:
     ):
         values["force"] = -force
         turned.append("force")
-    if "voltage" not in options.sign and values["voltage"].min() < -LEVEL_V:
+    if "voltage" in values and "voltage" not in options.sign and values["voltage"].min() < -LEVEL_V:
         values["voltage"] = np.abs(values["voltage"])
         if first:
             source.findings.note("sign", "the voltage is negative; its size is used, for the force goes by its square")
@@ -248,153 +291,45 @@ def _turned(part: Part, source: Source, *, first: bool) -> Part:
     return replace(part, values=values)
 
 
-# --- checks
-
-
-def _usable(name: str, part: Part, source: Source, specimen: Specimen) -> bool:
-    """Refuse what cannot be the displacement and force of this cone."""
-    findings, values = source.findings, part.values
-    h, force, voltage = values["displacement"], values["force"], values["voltage"]
-    before = len(findings.of("obstacle"))
-    if h.size < 5:
-        findings.obstacle(
-            "rows",
-            f"{name}: {h.size} rows with displacement and force are left; at least 5 are needed",
-            "--rows FIRST-LAST",
-        )
-        return False
-    for quantity, column in (("displacement", h), ("force", force)):
-        if not np.ptp(column) > 0.0:
-            findings.obstacle(
-                "constant",
-                f"{name}: the {quantity} is {column[0]:g} throughout; nothing varies",
-                f"--column {quantity}=NUMBER",
-            )
-    if len(findings.of("obstacle")) > before:
-        return False
-    for k in jumps_of(h, force)[:3]:
-        findings.obstacle(
-            "jump",
-            f"{name}: the displacement jumps from {1e3 * h[k - 1]:.4g} mm to {1e3 * h[k]:.4g} mm while the "
-            f"force goes on "
-            f"({force[k - 1]:.4g} N, {force[k]:.4g} N): was the sensor set to zero",
-            f"--rows {part.lines[0]}-{part.lines[k - 1]} keeps the rows before",
-            line=int(part.lines[k]),
-        )
-    for k in steps_of(force, h)[:3]:
-        if abs(voltage[k] - voltage[k - 1]) < 0.1 * max(1.0, float(np.abs(voltage).max())):
-            findings.obstacle(
-                "jump",
-                f"{name}: the force jumps from {force[k - 1]:.4g} N to {force[k]:.4g} N while the displacement "
-                f"goes on: was the load cell tared, or did the film break",
-                f"--rows {part.lines[0]}-{part.lines[k - 1]} keeps the rows before",
-                line=int(part.lines[k]),
-            )
-    _against_the_cone(name, h, force, specimen, source)
-    largest = float(np.abs(voltage).max())
-    if 0.0 < largest < LEAST_VOLTAGE:
-        findings.warning(
-            "voltage",
-            f"{name}: the highest voltage is {largest:.4g} V, which bends no film: is the unit kV",
-            "--unit voltage=kV",
-        )
-    _at_rest(name, h, force, findings)
-    field = largest / specimen.thickness
-    if field > MOST_FIELD:
-        findings.obstacle(
-            "implausible",
-            f"{name}: the highest voltage is {largest:.4g} V, {1e-6 * field:.3g} V/um across this film before it is "
-            "stretched, which no film stands: check the unit",
-            "--unit voltage=V",
-            line=source.understood.unit_line or source.understood.heading_line,
-        )
-    return len(findings.of("obstacle")) == before
-
-
-def _at_rest(name: str, h: Array, force: Array, findings: Findings) -> None:
-    """Tell of displacement and force that do not begin at zero."""
-    far, low = float(h.max()), float(h.min())
-    if low > NO_REST * far:
-        findings.warning(
-            "zero",
-            f"{name}: the displacement begins at {1e3 * low:.4g} mm; it has to be counted from where the disk touches "
-            "the film",
-            "--zero displacement=first",
-        )
-        return
-    rest = float(np.median(force[h < low + 0.02 * (far - low)]))
-    if abs(rest) > NO_REST * float(np.abs(force).max()):
-        findings.warning(
-            "zero",
-            f"{name}: the force is {rest:.3g} N where the displacement begins: was it set to zero",
-            "--zero force=first",
-        )
-
-
-def _against_the_cone(name: str, h: Array, force: Array, specimen: Specimen, source: Source) -> None:
-    """Hold the largest force against that of the cone as believed; a factor above 20 is no matter of the material."""
-    k = int(h.argmax())
-    measured = float(np.median(force[np.argsort(h)[-max(3, h.size // 100) :]]))
-    gap = specimen.ring_radius - specimen.disk_radius
-    expected = _model_force(specimen, float(h[k]))
-    ratio = measured / expected if expected and expected > 0.0 else float("nan")
-    swapped = _model_force(specimen, float(force.max()) * 1e-3)  # as if its numbers were mm, and those of h N
-    if 1.0 / IMPLAUSIBLE < ratio < IMPLAUSIBLE and h[k] < 5.0 * gap:
-        return
-    told = f"{expected:.3g} N" if expected else "no force that can be computed"
-    looks_swapped = swapped is not None and 1.0 / IMPLAUSIBLE < float(h.max()) * 1e3 / max(swapped, 1e-30) < IMPLAUSIBLE
-    source.findings.obstacle(
-        "implausible",
-        f"{name}: displacement {1e3 * h[k]:.4g} mm with force {measured:.4g} N is implausible for this cone, "
-        f"for which {told} "
-        f"is expected"
-        + (f" (a film {ratio:.3g} times as stiff as believed)" if np.isfinite(ratio) else "")
-        + (
-            ": displacement and force look exchanged"
-            if looks_swapped
-            else ": check the units and whether columns are exchanged"
-        ),
-        "--column displacement=NUMBER --column force=NUMBER, or --unit displacement=UNIT --unit force=UNIT",
-        line=source.understood.heading_line,
-    )
-
-
-def _model_force(specimen: Specimen, h: float) -> float | None:
-    """Force (N) of the cone as believed at 0 V; None where there is none."""
-    if not 0.0 < h < 20.0 * specimen.ring_radius:
-        return None
-    found = float(solve(specimen, h, 0.0).force)
-    return found if np.isfinite(found) else None
-
-
 # --- sweeps
 
 
-def _sweeps(name: str, part: Part, source: Source) -> list[Sweep]:
-    """Ways out and back, each at one voltage."""
-    values, options, findings = part.values, source.options, source.findings
-    h, voltage = values["displacement"], values["voltage"]
-    noise = noise_of(h)
+def _pairs(name: str, part: Part, source: Source) -> list[list[Leg]]:
+    """Ways out, each with the way back that follows, as far as they are asked for."""
+    h = part.values["displacement"]
     legs = legs_of(h)
     if len(legs) > 2 * MOST_SWEEPS:
-        findings.obstacle(
+        source.findings.obstacle(
             "sweeps",
             f"{name}: {len(legs)} changes of direction were counted; at most {2 * MOST_SWEEPS} are read",
             "--rows FIRST-LAST",
         )
         return []
-    same = repeated_rows(h, values["force"], voltage, *([values["time"]] if "time" in values else []))
-    if same.sum() > 0.2 * same.size:
-        findings.warning("repeated", f"{name}: {int(same.sum())} rows repeat the row before them; they are left out")
-    branch = options.branch or "all"
     pairs = _out_and_back(legs)
-    if branch == "first-loading":
-        pairs = [pair[:1] for pair in pairs[:1]] if not np.ptp(voltage) > LEVEL_V else [pair[:1] for pair in pairs]
-    levels = [_level(voltage, pair, h) for pair in pairs]
-    if options.voltage:
-        levels = _stated_levels(name, len(pairs), source)
+    if source.options.branch == "first-loading":
+        one_voltage = not np.ptp(part.values.get("voltage", h[:1])) > LEVEL_V
+        return [pair[:1] for pair in (pairs[:1] if one_voltage else pairs)]
+    return pairs
+
+
+def _sweeps(run: Run) -> list[Sweep]:
+    """Ways out and back, each at one voltage."""
+    part, pairs, findings = run.part, run.pairs, run.source.findings
+    values = part.values
+    h = values["displacement"]
+    noise = noise_of(h)
+    same = repeated_rows(h, values["force"], *(values[name] for name in ("voltage", "time") if name in values))
+    if same.sum() > 0.2 * same.size:
+        findings.warning(
+            "repeated", f"{run.name}: {int(same.sum())} rows repeat the row before them; they are left out"
+        )
+    if run.stated is not None:
+        levels, voltage = run.stated, values.setdefault("voltage", np.zeros(h.size))
     else:
+        voltage = values["voltage"]
+        levels = [_level(voltage, pair, h) for pair in pairs]
         pairs = _parted_by_voltage(pairs, levels, voltage)
+    branch = run.source.options.branch
     sweeps = []
     rest = REST * noise + 1e-3 * float(np.ptp(h))
     for pair, level in zip(pairs, levels, strict=False):
@@ -403,25 +338,29 @@ def _sweeps(name: str, part: Part, source: Source) -> list[Sweep]:
         keep = ~same[rows] if same.sum() > 0.2 * same.size else np.ones(rows.size, dtype=np.bool_)
         if branch in ("loading", "unloading"):
             keep &= direction == (1 if branch == "loading" else -1)
-        if not options.voltage:
-            off = np.abs(voltage[rows] - level) > max(ALLOWED_V, ALLOWED_PART * abs(level))
-            if off.sum() > 0.3 * off.size:
-                findings.obstacle(
-                    "voltage",
-                    f"{name}: the voltage changes during the sweep that begins here ({voltage[rows].min():.4g} "
-                    f"to {voltage[rows].max():.4g} V)",
-                    "--rows FIRST-LAST keeps sweeps at one voltage",
-                    line=int(part.lines[rows[0]]),
-                )
-            keep &= ~off
+        if run.stated is None:
+            keep &= _at_level(run, rows, voltage, level)
         if keep.sum() >= 3:
             sweeps.append(Sweep(rows[keep], direction[keep], level))
-    if options.voltage:
-        for sweep in sweeps:
-            voltage[sweep.rows] = sweep.voltage
-    elif sweeps:
-        sweeps = _common_levels(sweeps)
+    if run.stated is None:
+        return _common_levels(sweeps)
+    for sweep in sweeps:
+        voltage[sweep.rows] = sweep.voltage
     return sweeps
+
+
+def _at_level(run: Run, rows: NDArray[np.intp], voltage: Array, level: float) -> NDArray[np.bool_]:
+    """Rows at the voltage of their sweep; a sweep on which it changes throughout is refused."""
+    off = np.abs(voltage[rows] - level) > max(ALLOWED_V, ALLOWED_PART * abs(level))
+    if off.sum() > 0.3 * off.size:
+        run.source.findings.obstacle(
+            "voltage",
+            f"{run.name}: the voltage changes during the sweep that begins here ({voltage[rows].min():.4g} "
+            f"to {voltage[rows].max():.4g} V)",
+            "--rows FIRST-LAST keeps sweeps at one voltage",
+            line=int(run.part.lines[rows[0]]),
+        )
+    return np.asarray(~off)
 
 
 def _out_and_back(legs: Sequence[Leg]) -> list[list[Leg]]:
@@ -494,7 +433,7 @@ def _common_levels(sweeps: Sequence[Sweep]) -> list[Sweep]:
         else:
             groups.append([k])
     levelled = list(sweeps)
-    largest = max(abs(sweep.voltage) for sweep in sweeps)
+    largest = max((abs(sweep.voltage) for sweep in sweeps), default=0.0)
     for group in groups:
         level = float(np.median([sweeps[k].voltage for k in group]))
         level = 0.0 if abs(level) < min(LEVEL_V, 0.02 * largest) else round(level, 1)
@@ -503,26 +442,10 @@ def _common_levels(sweeps: Sequence[Sweep]) -> list[Sweep]:
     return levelled
 
 
-def _stated_levels(name: str, count: int, source: Source) -> list[float]:
-    stated = source.options.voltage
-    if len(stated) == 1:
-        return list(stated) * count
-    if len(stated) != count:
-        source.findings.obstacle(
-            "voltage",
-            f"{name}: {len(stated)} voltages are stated, and there are {count} sweeps",
-            "--voltage with one value a sweep, or one for all",
-        )
-        return []
-    return list(stated)
-
-
-def _with_known_voltage(
-    name: str, curves: list[Curve], part: Part, sweeps: Sequence[Sweep], source: Source
-) -> list[Curve]:
+def _with_known_voltage(run: Run, curves: list[Curve]) -> list[Curve]:
     """Where the voltage reads zero throughout and sweeps differ, only the first can be said to be at 0 V."""
-    findings = source.findings
-    if not curves or source.options.voltage or float(np.abs(part.values["voltage"]).max()) > LEVEL_V:
+    name, part, findings = run.name, run.part, run.source.findings
+    if not curves or run.stated is not None or float(np.abs(part.values["voltage"]).max()) > LEVEL_V:
         return curves
     largest = max(float(curve.force.max()) for curve in curves)
     highest = float(np.abs(part.values["voltage"]).max())

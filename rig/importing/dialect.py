@@ -37,21 +37,37 @@ MISSING = frozenset(
         "-inf",
         "+inf",
         "infinity",
+        "ovld",
+        "ovfl",
+        "overflow",
+        "overrange",
+        "underflow",
+        "missing",
+        "void",
+        "#ref!",
+        "#num!",
+        "#zahl!",
+        "#nombre!",
+        "....",
+        "...",
+        "----",
+        "-----",
+        "_",
         "ol",
         "overload",
         "over",
         "#div/0!",
         "#wert!",
         "#value!",
-        "#nombre!",
+        "#valeur!",
         "err",
         "error",
         "?",
         "*",
     )
 )
-POINT = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-COMMA = r"[+-]?(?:[0-9]+,?[0-9]*|,[0-9]+)(?:[eE][+-]?[0-9]+)?"
+POINT = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eEdD][+-]?[0-9]+)?"
+COMMA = r"[+-]?(?:[0-9]+,?[0-9]*|,[0-9]+)(?:[eEdD][+-]?[0-9]+)?"
 GROUPED_POINT = r"[+-]?[1-9][0-9]{0,2}(?:[,'’ \u00a0\u202f][0-9]{3})+(?:\.[0-9]*)?"
 GROUPED_COMMA = r"[+-]?[1-9][0-9]{0,2}(?:[.'’ \u00a0\u202f][0-9]{3})+(?:,[0-9]*)?"
 SAMPLE = (200, 300, 60)  # lines from the beginning, the middle and the end
@@ -106,7 +122,8 @@ class Dialect:
             cell = "-" + cell[1:]
         if not PLAIN[self.decimal].fullmatch(cell):
             cell = re.sub(r"[^0-9+\-" + re.escape(self.decimal) + "]", "", cell)
-        return float(cell.replace(",", ".") if self.decimal == "," else cell)
+        cell = cell.replace(",", ".") if self.decimal == "," else cell
+        return float(cell.replace("D", "e").replace("d", "e"))  # Fortran writes 1.5D-01
 
 
 PLAIN = {".": re.compile(POINT), ",": re.compile(COMMA)}

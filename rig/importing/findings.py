@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -96,3 +97,19 @@ def refuse(findings: Iterable[Finding], understood: Sequence[str] = ()) -> None:
 def shortened(text: str) -> str:
     """The text, or its beginning where it is long."""
     return text if len(text) <= LONGEST_CELL else text[: LONGEST_CELL - 3] + "..."
+
+
+def spans(lines: Sequence[int], most: int = 4) -> str:
+    """Line numbers in words: "3, 17-20".
+
+    >>> spans([3, 17, 18, 19]), spans([1, 3, 5, 7, 9, 11])
+    ('3, 17-19', '1, 3, 5, 7 and more')
+    """
+    parts: list[list[int]] = []
+    for line in sorted(Counter(lines)):
+        if parts and line == parts[-1][1] + 1:
+            parts[-1][1] = line
+        else:
+            parts.append([line, line])
+    words = [f"{low}" if low == high else f"{low}-{high}" for low, high in parts[:most]]
+    return ", ".join(words) + (" and more" if len(parts) > most else "")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rig.importing.units import NOT_A_UNIT_ALONE, Unit, unit_of
 
@@ -105,6 +105,11 @@ AT_DRIVE = (
 )
 
 
+AT_VOLTAGE = re.compile(
+    r"(?:(?:\bat|@|\bbei|\bà|\bU ?=|\bV ?=)\s*)?(?<![\w.,])(\d+(?:[.,]\d+)?)\s?(kV|V)(?![A-Za-z0-9])"
+)
+
+
 @dataclass(frozen=True)
 class Heading:
     """A heading as it was understood.
@@ -112,7 +117,7 @@ class Heading:
     ``quantity`` is one of `DIMENSION`, or "index", "specimen", "cycle", "other", "" (not known). ``rank`` is 2 where
     the name says that the specimen itself was measured, 0 where it is a set value or the drive's own, else 1.
     ``direction`` is 1 or 2 for biaxial tests, 0 where the name has no number. ``weak`` is set where only the unit
-    tells the quantity.
+    tells the quantity. ``at_voltage`` (V) is the voltage in a heading such as "F at 1 kV (mN)".
     """
 
     text: str
@@ -123,6 +128,7 @@ class Heading:
     rank: int = 1
     direction: int = 0
     weak: bool = False
+    at_voltage: float | None = None
 
 
 def fold(text: str) -> str:
@@ -182,8 +188,23 @@ def _looks_like_unit(text: str) -> bool:
     )
 
 
+def voltage_in(text: str) -> float | None:
+    """The voltage (V) that a text names; None where it names none, or several.
+
+    >>> voltage_in("F @ 1,5 kV (mN)"), voltage_in("0 V"), voltage_in("cone 1000V run2"), voltage_in("U (V)")
+    (1500.0, 0.0, 1000.0, None)
+    """
+    found = AT_VOLTAGE.findall(text)
+    return float(found[0][0].replace(",", ".")) * (1e3 if found[0][1] == "kV" else 1.0) if len(found) == 1 else None
+
+
 def understand(text: str, unit_cell: str = "") -> Heading:
     """What a heading, and the cell of the unit row under it, mean."""
+    at_voltage = voltage_in(text.replace("_", " "))
+    if at_voltage is not None:
+        rest = understand(AT_VOLTAGE.sub(" ", text.replace("_", " ")).strip(" ,;:_-/()[]@="), unit_cell)
+        if rest.quantity in ("force", "displacement", "time"):
+            return replace(rest, text=text, at_voltage=at_voltage)
     name, unit_text, unit = split_unit(text)
     if unit_cell.strip().strip("()[]"):
         unit, unit_text = unit_of(unit_cell), unit_cell.strip().strip("()[]")

@@ -40,7 +40,7 @@ def kind_in(text: str) -> str | None:
     >>> [kind_in(t) for t in ("equi-biaxial_test", "Zugversuch_3", "planar", "strip_biaxial", "shear", "UT.txt")]
     ['equibiaxial', 'uniaxial', 'pure shear', 'pure shear', None, 'uniaxial']
     """
-    folded = fold(text)
+    folded = re.sub(r"(?<=[a-z])(?=[0-9])", " ", fold(text))  # Zug1
     return next((kind for kind, pattern in NAMES if re.search(pattern, folded)), None)
 
 

@@ -17,7 +17,7 @@ HALF_DAY = 0.5 * DAY
 
 
 def column_values(cells: Sequence[str], dialect: Dialect) -> tuple[Array, list[int]]:
-    """Numbers of a column, nan for empty cells; and the rows whose cell is neither empty nor a finite number."""
+    """Numbers of a column, nan where a cell is empty or marks a missing value; and the rows with any other cell."""
     text = "\n".join(cells)
     # The fast road; float() also takes "1_0" and "nan", which are looked for apart, and a point may part thousands.
     if "_" not in text and not (dialect.decimal == "," and "." in text):
@@ -35,7 +35,7 @@ def column_values(cells: Sequence[str], dialect: Dialect) -> tuple[Array, list[i
             values[row] = dialect.value(cell)
             if not np.isfinite(values[row]):
                 bad.append(row)
-        elif kind != "E":
+        elif kind not in "EM" or "inf" in cell.casefold():  # an infinite value is a wrong one, not a missing one
             bad.append(row)
     return values, bad
 

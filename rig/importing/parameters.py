@@ -22,10 +22,11 @@ NAMES = (
         "length",
         r"\b(gauge|gage|initial|specimen|sample|original) length|^length|messlange|einspannlange|"
         r"anfangslange|probenlange|"
-        r"longueur|\bl ?0$|grip (to grip )?separation|dimension length",
+        r"longueur|^lange|\bl ?0\b|grip (to grip )?separation",
     ),
 )
 NOT_A_DIMENSION = re.compile(r"final|after|at break|deformed|bruch|maximum|tolerance|unit|increment|change|rate|speed")
+ANY = re.compile(r".+")
 OVER_SPECIMENS = (
     r"mean|average|median|std|standard|deviation|coefficient|minimum|maximum|range|mittel|abweichung|moyenne"
 )
@@ -82,12 +83,28 @@ def _is_result(row: TextRow, dialect: Dialect) -> bool:
 
 def _named(title: str) -> str:
     """The dimension that a title names; "" where it names none, or not that of the undeformed specimen."""
-    folded = fold(title)
+    folded = fold(title.rpartition(" : ")[2])  # Bluehill writes the group of a parameter before it
     name = next((name for name, pattern in NAMES if re.search(pattern, folded)), "")
     return "" if NOT_A_DIMENSION.search(folded) else name
 
 
 def _parameter(row: TextRow, dialect: Dialect) -> Parameter | None:
+    """A dimension of the specimen in one row."""
+    found = named_value(row, dialect, ANY)
+    if found is None:
+        return None
+    title, values, unit = found
+    name = _named(title)
+    values = tuple(value for value in values if value > 0.0)
+    if not name or not values or unit is None or unit.dimension != ("area" if name == "area" else "length"):
+        return None
+    return Parameter(name, tuple(value * unit.factor for value in values), row.line, ", ".join(row.given))
+
+
+def named_value(
+    row: TextRow, dialect: Dialect, wanted: re.Pattern[str]
+) -> tuple[str, tuple[float, ...], Unit | None] | None:
+    """Title, values and unit of a row of the form name, value, unit whose folded name is ``wanted``; else None."""
     given = row.given
     if len(given) == 1 or dialect.separator == " ":
         text = " ".join(given)
@@ -98,14 +115,10 @@ def _parameter(row: TextRow, dialect: Dialect) -> Parameter | None:
     if len(given) < 2 or not re.search(r"[A-Za-z]", given[0]):
         return None
     title, _, unit = split_unit(given[0].rstrip(" :="))
-    name = _named(title)
-    if not name:
+    if not wanted.fullmatch(fold(title)):
         return None
     values, unit = _values(given[1:], dialect, unit)
-    wanted = "area" if name == "area" else "length"
-    if not values or unit is None or unit.dimension != wanted:
-        return None
-    return Parameter(name, tuple(value * unit.factor for value in values), row.line, ", ".join(given))
+    return title, tuple(values), unit
 
 
 def _values(cells: Sequence[str], dialect: Dialect, unit: Unit | None) -> tuple[list[float], Unit | None]:
@@ -125,7 +138,7 @@ def _values(cells: Sequence[str], dialect: Dialect, unit: Unit | None) -> tuple[
             break
         else:
             break
-    return [value for value in values if math.isfinite(value) and value > 0.0], unit
+    return [value for value in values if math.isfinite(value)], unit
 
 
 @dataclass(frozen=True)

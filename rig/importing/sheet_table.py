@@ -206,10 +206,10 @@ def _read(source: Source, piece: Piece, kind: str | None, *, first: bool) -> tup
         how = ""
     else:
         chosen, how = _one_direction(chooser, piece, source, findings)
-    if len(chosen) < (4 if two else 2):
-        return None, ""
     if first or len(source.pieces) > 1:
         source.understood.take(chosen)
+    if len(chosen) < (4 if two else 2):
+        return None, ""
     time = Chooser(table, piece.group, source.options, Findings("")).choose("time")
     chosen += [time] if time is not None and time.unit.name else []
     part, left_out = read_columns(table, piece.section, chosen, piece.label, source.options, source.findings)
@@ -259,7 +259,7 @@ def _one_direction(chooser: Chooser, piece: Piece, source: Source, findings: Fin
                     f"--column {others[0].replace(' ', '-')}=...",
                 )
         else:
-            _ask(axis, [name for name, _ in present], chooser, findings)
+            _ask(axis, [name for name, _ in present], chooser, findings, source.understood)
     how = []
     for one in chosen:
         source_of = {
@@ -291,11 +291,12 @@ def _one_direction(chooser: Chooser, piece: Piece, source: Source, findings: Fin
     return chosen, ""
 
 
-def _ask(axis: str, present: Sequence[str], chooser: Chooser, findings: Findings) -> None:
+def _ask(axis: str, present: Sequence[str], chooser: Chooser, findings: Findings, understood: Understood) -> None:
     """Say what is missing for the stretch ("x") or the stress ("y")."""
     table = chooser.table
     if present:
-        chooser.choose(present[0])  # what else is wrong with the column is asked at once
+        one = chooser.choose(present[0])  # what else is wrong with the column is asked at once
+        understood.take([one] if one is not None else [])
     if axis == "x" and present:
         findings.obstacle(
             "length",
@@ -312,9 +313,11 @@ def _ask(axis: str, present: Sequence[str], chooser: Chooser, findings: Findings
             line=table.heading_line,
         )
     else:
-        what = "stretch or strain" if axis == "x" else "nominal stress"
+        what = "stretch or strain" if axis == "x" else "nominal stress or force"
         option = (
-            "--column stretch=NUMBER (or strain=NUMBER)" if axis == "x" else "--column stress=NUMBER --unit stress=UNIT"
+            "--column stretch=NUMBER (or strain=NUMBER, or displacement=NUMBER with --length-mm LENGTH)"
+            if axis == "x"
+            else "--column stress=NUMBER --unit stress=UNIT (or force=NUMBER, with --area-mm2 AREA)"
         )
         heading = "there is no heading" if table.heading_line is None else f"the columns are {chooser.listing()}"
         findings.obstacle("columns", f"no column of {what} was found; {heading}", option, line=table.heading_line)

@@ -9,8 +9,10 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
+from rig.importing.cell_words import without_words
 from rig.importing.dialect import Dialect, judge, recogniser
 from rig.importing.findings import Findings, shortened
 from rig.importing.headings import DIMENSION, Heading, fold, is_unit_row, understand
@@ -20,15 +22,18 @@ from rig.importing.units import unit_of
 FEWEST_ROWS = 3
 MOST_COLUMNS = 2000
 MOST_WIDE = 0.02  # of the rows that may hold more values than the table has columns
+PAGE = 8  # rows at the end of a page from which it is told whether the next goes on
 SAMPLED = 5000  # lines of which every one is looked at to find the columns
 REMARK = re.compile(r"^\s*(#|%|//|!|\*)+\s*")
 LABEL = re.compile(
     r"^\W*(specimen|sample|probe|prufling|eprouvette|echantillon|test|messung|versuch|run|essai|curve|kurve|"
     r"zyklus|cycle)\b.{0,60}$"
 )
-WITH_UNIT = re.compile(r"(?:^|[;,|\t]\s*)[+-]?\d+(?:[.,]\d+)?\s?(?:%|[a-zA-Zµ]{1,3}(?:/mm2|/mm²)?)(?=\s*(?:$|[;,|\t]))")
-NAMED = re.compile(r"(?:^|[\s;,|])[A-Za-z_][\w()/%]*\s?[:=]\s?[+-]?\d+(?:[.,]\d+)?(?=\s*(?:$|[\s;,|]))")
 REMARKS = ("comment", "comments", "kommentar", "commentaire", "remark", "remarks", "bemerkung")
+STATISTIC = re.compile(  # what stands before the numbers in a row of statistics over the rows above it
+    r"(mean|average|avg|median|std|stdev|standard dev\w*|s d|deviation|variance|coefficient|max(imum)?|min(imum)?|"
+    r"range|sum|count|mittel\w*|standardabweichung|summe|anzahl|moyenne|ecart type|mediane|somme|total)\b"
+)
 RULE = re.compile(r"[-=_:+~]{2,}")  # a line that is drawn
 UNIT_ROW_LABELS = ("unit", "units", "einheit", "einheiten", "unite", "unites", "y unit label", "uom", "dimension")
 
@@ -90,12 +95,14 @@ class RawTable:
 
 def find_table(text: TableText, findings: Findings, separator: str | None, decimal: str | None) -> RawTable | None:
     """The table in the lines of a file; None, with an obstacle, where there is none."""
-    dialect = judge(text.lines, findings, separator, decimal)
+    lines, words, parted = without_words(text.lines)
+    text = replace(text, lines=lines)
+    dialect = judge(text.lines, findings, separator or parted or None, decimal)
     form = None if dialect is None else _columns(text.lines, dialect)
     if dialect is None or form is None:
         findings.obstacle(
             "table",
-            "no rows of at least two numbers were found" + _what_cells_hold(text.lines),
+            "no rows of at least two numbers were found",
             '--separator ";" and --decimal "," tell how the numbers are written',
         )
         return None
@@ -112,33 +119,46 @@ def find_table(text: TableText, findings: Findings, separator: str | None, decim
     main = max(sections, key=lambda one: len(one.rows))
     heads = [_heading(section.lead, width, numeric, dialect) for section in (main, *sections)]
     head = next((one for one in heads if one.names), heads[0])
-    kept = []
+    kept: list[Section] = []
     for section in sections:
         own = _heading(section.lead, width, numeric, dialect)
         if own.names and head.names and [fold(a) for a in own.names] != [fold(a) for a in head.names]:
             left_out.append(LeftOut(section.lines[0], f"another table of {len(section.rows)} rows", str(own.names)))
             continue
         section.label = _label(section.lead, own)
-        kept.append(section)
+        if kept and _goes_on(kept[-1], section, numeric, dialect):
+            kept[-1].lines += section.lines
+            kept[-1].rows += section.rows
+            left_out += [
+                LeftOut(row.line, "heading repeated", text.lines[row.line - 1]) for row in section.lead if row.cells
+            ]
+        else:
+            kept.append(section)
     _check_heading(head, width, numeric, findings)
     units = head.units or _unit_row_above(preamble, width)
     headings = []
     for j in range(width):
         name = head.names[j] if j < len(head.names) else ""
         unit = units[1][j] if units and j < len(units[1]) else ""
-        headings.append(understand(name, unit))
+        said = words[j] if j < len(words) else ("", "")
+        headings.append(_with_words(understand(name or said[0], unit), said, findings))
     return RawTable(
         text, dialect, headings, head.line, units[0] if units else None, head.labels, kept, preamble, left_out, numeric
     )
 
 
-def _what_cells_hold(lines: Sequence[str]) -> str:
-    """What stands beside the numbers of most lines, and keeps them from being a table."""
-    for pattern, what in ((NAMED, "names"), (WITH_UNIT, "units")):
-        found = [line for line in lines if pattern.search(line)]
-        if len(found) > 0.5 * len(lines):
-            return f"; cells hold their {what}, as in {shortened(found[-1])!r}: write them once, in the heading"
-    return ""
+def _with_words(heading: Heading, said: tuple[str, str], findings: Findings) -> Heading:
+    """The heading with the unit that stands in every cell."""
+    unit = unit_of(said[1])
+    if unit is None:
+        return heading
+    if heading.unit is not None and heading.unit.name != unit.name:
+        findings.obstacle(
+            "unit",
+            f"the heading {heading.text!r} says {heading.unit_text}, and its cells say {said[1]}",
+            f"--unit {heading.quantity or 'QUANTITY'}=UNIT",
+        )
+    return understand(heading.name, said[1]) if heading.unit is None else heading
 
 
 def _columns(lines: Sequence[str], dialect: Dialect) -> tuple[int, list[bool]] | None:
@@ -212,7 +232,7 @@ def _sections(
         current.rows.append(cells + [""] * (width - len(cells)) if len(cells) < width else cells[:width])
     sections.append(current)
     left_out += [LeftOut(row.line, "no row of numbers", text.lines[row.line - 1]) for row in waiting if row.cells]
-    kept = []
+    kept: list[Section] = []
     for section in sections:
         preamble += section.lead
         if len(section.rows) - section.bad >= FEWEST_ROWS:
@@ -230,6 +250,8 @@ def _sections(
 
 def _text_row(number: int, line: str, dialect: Dialect) -> TextRow:
     mark = REMARK.match(line)
+    if mark and is_unit_row(dialect.cells(line)):  # "%;MPa" is no remark
+        mark = None
     rest = line[mark.end() :] if mark else line
     return TextRow(number, dialect.cells(rest), bool(mark))
 
@@ -237,6 +259,8 @@ def _text_row(number: int, line: str, dialect: Dialect) -> TextRow:
 def _state(dialect: Dialect, cells: list[str], width: int, numeric: Sequence[bool]) -> str:
     """ "clean", "bad" (a row of the table with a cell that is no number), "wide" or "text"."""
     kinds = [dialect.kind(cell) for cell in cells]
+    if "X" in kinds and STATISTIC.match(fold(cells[kinds.index("X")])):
+        return "text"
     while len(kinds) > width and kinds[-1] == "E":
         kinds.pop()
     wide = len(kinds) > width
@@ -274,6 +298,27 @@ def _divides(waiting: Sequence[TextRow], current: Section, cells: Sequence[str],
     return False
 
 
+def _goes_on(before: Section, after: Section, numeric: Sequence[bool], dialect: Dialect) -> bool:
+    """Whether rows under a repeated heading are the same run on another page, and not another specimen.
+
+    A column that has gone one way without a step back goes on that way from where it was, and no column jumps.
+    """
+    if after.label or before.label or len(before.rows) < PAGE or len(after.rows) < 2:
+        return False
+    rising = False
+    for j, one in enumerate(numeric):
+        cells = [row[j].strip() for row in (*before.rows[-PAGE:], *after.rows[:2])] if one else []
+        if not one or any(dialect.kind(cell) != "N" for cell in cells):
+            continue  # times of day, blanks
+        values = [dialect.value(cell) for cell in cells]
+        steps = [b - a for a, b in pairwise(values)]
+        usual = sorted(map(abs, steps[: PAGE - 1]))[PAGE // 2]
+        if abs(steps[PAGE - 1]) > 6.0 * max(usual, max(map(abs, steps[: PAGE - 1]))):
+            return False
+        rising |= all(step > 0.0 for step in steps) or all(step < 0.0 for step in steps)
+    return rising
+
+
 def _number(cells: Sequence[str], dialect: Dialect) -> float | None:
     cell = next((cell.strip() for cell in cells if cell.strip()), "")
     return dialect.value(cell) if dialect.kind(cell) == "N" else None
@@ -307,6 +352,7 @@ def _heading(lead: list[TextRow], width: int, numeric: Sequence[bool], dialect: 
             continue
         cells = _glued(row.cells, width) if dialect.separator == " " else row.cells
         shifted = ["", *cells[1:]] if cells and fold(cells[0]) in UNIT_ROW_LABELS else cells
+        shifted = shifted if is_unit_row(shifted) else shifted[:width]  # a remark may stand behind the units
         if units is None and len([c for c in shifted if c]) >= min(2, usable) and is_unit_row(shifted):
             units = (row.line, _fitted(shifted, width))
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +32,8 @@ BINARY = (
     (b"%PDF", "a PDF file", "ask for the numbers as text"),
     (b"\x1f\x8b", "a compressed file", "unpack it first"),
 )
+OPEN_QUOTE = re.compile(r'(?:^|[,;\t|])\s*"[^"]*$')  # a cell that begins with a quotation mark and does not end
+MARKUP = (b"<html", b"<!doctype", b"<table", b"<?xml")
 
 
 @dataclass(frozen=True)
@@ -77,15 +80,37 @@ def read_text(path: Path, encoding: str | None = None) -> TableText:
     for magic, what, remedy in BINARY:
         if raw.startswith(magic):
             raise _refused(path, f"this is {what}, not a table of text; {remedy}")
+    if raw.lstrip()[:9].lower().startswith(MARKUP):
+        raise _refused(
+            path,
+            "this is a web page, or a workbook saved as one (HTML or XML), not a table of text; save the "
+            "sheet as CSV first",
+        )
     text, name = _decoded(path, raw, encoding)
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     ends_whole = text.endswith("\n")
-    lines = text.split("\n")
+    lines = _joined(text.split("\n"))
     if ends_whole:
         lines.pop()
     if not any(line.strip() for line in lines):
         raise _refused(path, "the file is empty")
     return TableText(path, lines, name, ends_whole)
+
+
+def _joined(lines: list[str]) -> list[str]:
+    """Lines with a quoted cell that goes on in the next ones (a heading of two lines in a spreadsheet) as one line.
+
+    Empty lines stand in the place of the others, so that lines keep their numbers.
+    """
+    for k, line in enumerate(lines):
+        if '"' not in line or not OPEN_QUOTE.search(line):
+            continue
+        for more in range(1, 4):
+            whole = " ".join(lines[k : k + more + 1])
+            if not OPEN_QUOTE.search(whole):
+                lines[k : k + more + 1] = [whole, *[""] * more]
+                break
+    return lines
 
 
 def _decoded(path: Path, raw: bytes, encoding: str | None) -> tuple[str, str]:
@@ -99,6 +124,9 @@ def _decoded(path: Path, raw: bytes, encoding: str | None) -> tuple[str, str]:
         if raw.startswith(mark):
             return raw.decode(codec, errors="replace"), name
     head = raw[:SAMPLE_BYTES]
+    if b"\0" in head and b"\0" not in raw.rstrip(b"\0"):  # a file system that lost its power fills up with zeros
+        text, name = _decoded(path, raw.rstrip(b"\0"), None)
+        return text, f"{name}, zeros at its end left out"
     if b"\0" in head:
         # ASCII in UTF-16 has a zero in every other byte; a binary file has them anywhere.
         for offset, codec in ((1, "utf-16-le"), (0, "utf-16-be")):

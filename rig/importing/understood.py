@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from rig.importing.columns import Chosen
 from rig.importing.dialect import SEPARATOR_NAMES
-from rig.importing.findings import Finding, shortened
+from rig.importing.findings import Finding, shortened, spans
 from rig.importing.table import LeftOut, RawTable
 
 
@@ -127,19 +126,3 @@ class Understood:
             for why, lines in self.left_out.items()
         ]
         return "; " + "; ".join(words) if words else ""
-
-
-def spans(lines: Sequence[int], most: int = 4) -> str:
-    """Line numbers in words: "3, 17-20".
-
-    >>> spans([3, 17, 18, 19]), spans([1, 3, 5, 7, 9, 11])
-    ('3, 17-19', '1, 3, 5, 7 and more')
-    """
-    parts: list[list[int]] = []
-    for line in sorted(Counter(lines)):
-        if parts and line == parts[-1][1] + 1:
-            parts[-1][1] = line
-        else:
-            parts.append([line, line])
-    words = [f"{low}" if low == high else f"{low}-{high}" for low, high in parts[:most]]
-    return ", ".join(words) + (" and more" if len(parts) > most else "")

@@ -179,6 +179,18 @@ def test_every_card_has_a_reader_and_states_both_conventions() -> None:
             assert "Convention of this card: W = " in text and "Convention of dea-rig: W = " in text
 
 
+@pytest.mark.parametrize("film", FILMS, ids=lambda film: film.name[:5])
+def test_the_card_of_a_sheet_is_the_same_without_a_permittivity(film: Material) -> None:
+    whole = material_cards(film)
+    for name, text in material_cards(film, electric=False).items():
+        kept = [line for line in text.splitlines() if "Sheet identified" not in line and "Small-strain" not in line]
+        gone = [line for line in whole[name].splitlines() if line not in text.splitlines()]
+        assert set(kept) <= set(whole[name].splitlines()) and "permittivity not known" in text
+        electric = [line for line in gone if "DIELECTRIC" in line or "PERX" in line or line.startswith("epsilonr")]
+        assert bool(electric) == (name != "film_febio.xml")
+        assert len(gone) == 2 + (2 if name == "film_abaqus.inp" else len(electric))
+
+
 def test_what_no_program_has_is_refused_by_its_name() -> None:
     class Own(NeoHooke):
         name, title = "own", "own law"

@@ -139,3 +139,31 @@ def test_a_folder_is_taken_for_its_logs(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
     result = CliRunner().invoke(main, ["fit", str(tmp_path / "logs")])
     assert result.exit_code == 2 and "there is no log (*.mcap) in this folder" in result.output
+
+
+SHEET = "stretch,stress (Pa)\n" + "".join(
+    f"{1 + k / 20:.2f},{3e4 * (1 + k / 20 - (1 + k / 20) ** -2):.3f}\n" for k in range(21)
+)
+
+
+def test_a_sheet_has_material_cards_without_a_permittivity(tmp_path: Path) -> None:
+    (tmp_path / "uniaxial.csv").write_text(SHEET, encoding="utf-8")
+    words = ["fit-tests", str(tmp_path / "uniaxial.csv"), "--law", "neo-hooke", "--cards", str(tmp_path / "cards")]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    cards = {path.name: path.read_text() for path in (tmp_path / "cards").iterdir()}
+    assert set(cards) == {"film_abaqus.inp", "film_ansys.mac", "film_comsol.txt", "film_febio.xml"}
+    c10 = float(re.search(r"NEO HOOKE\n([\d.e+]+),", cards["film_abaqus.inp"])[1])  # type: ignore[index] # or it fails
+    assert c10 == pytest.approx(1.5e4, rel=1e-4)
+    assert not any("DIELECTRIC" in text or "PERX" in text or "epsilonr" in text for text in cards.values())
+    assert CliRunner().invoke(main, words).exit_code == 2  # nothing is overwritten
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(["--law", "mooney"], "Did you mean mooney_rivlin?"), (["--fix", "mu=3"], "--fix: cannot fix mu; what can be")],
+)
+def test_an_option_that_names_what_is_not_there_cannot_be_used(tmp_path: Path, words: list[str], told: str) -> None:
+    (tmp_path / "uniaxial.csv").write_text(SHEET, encoding="utf-8")
+    result = CliRunner().invoke(main, ["fit-tests", str(tmp_path / "uniaxial.csv"), *words])
+    assert result.exit_code == 2 and told in result.output
