@@ -107,7 +107,7 @@ def identify_logs(
     }
     provenance |= said_in([run.log for run in runs])
     if len(set(hashes.values())) < len(paths):
-        raise DataError("The same log is given twice; it would count as if it had been measured twice.")
+        raise ConfigError("The same log is given twice; it would count as if it had been measured twice.")
     curves: list[Curve] = []
     records: list[Record] = []
     try:

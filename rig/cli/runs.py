@@ -34,6 +34,8 @@ def command(
 
     _check_date("--since", since)
     _check_date("--until", until)
+    if since and until and since[: len(until)] > until[: len(since)]:
+        raise click.BadParameter(f"{since} comes after --until {until}: no day lies between", param_hint="--since")
     entries = runs_in(folder)
     found = chosen(entries, words, specimen=specimen, operator=operator, outcome=outcome, since=since, until=until)
     columns: dict[str, list[str]] = {}

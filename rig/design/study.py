@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self, get_args
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from model.actuator.bias import Mass, Spring
 from model.actuator.design import Recipe, SameFilm, Treatment
@@ -221,7 +221,13 @@ class BoundaryStudy(Table):
     )
 
 
-Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+def _rising(values: list[float]) -> list[float]:
+    if not values[0] < values[1]:
+        raise ValueError(f"the lowest value stands first and the highest second: [{min(values):g}, {max(values):g}]")
+    return values
+
+
+Range = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 
 
 class BoundsTable(Table):
@@ -242,6 +248,16 @@ class BoundsTable(Table):
     )
     weight_N: Range | None = Field(default=None, description="Lowest and highest weight (N).")
     spacer_mm: Range | None = Field(default=None, description="Lowest and highest length of the spacer (mm).")
+
+    @model_validator(mode="after")
+    def _possible(self) -> BoundsTable:
+        if self.radius_ratio is not None and not self.radius_ratio[1] < 1.0:
+            raise ValueError(
+                f"radius_ratio reaches {self.radius_ratio[1]:g}: the disk is smaller than the ring, below 1"
+            )
+        if self.prestretch is not None and self.prestretch[0] < 1.0:
+            raise ValueError(f"prestretch begins at {self.prestretch[0]:g}: 1 is a film that is not stretched")
+        return self
 
     def si(self) -> dict[str, tuple[float, float]]:
         """By the model's names, in SI units."""

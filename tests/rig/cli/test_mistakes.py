@@ -202,6 +202,7 @@ def test_a_plan_that_cannot_be_carried_out(bench: Path, slip_of_hand: str) -> No
 
 LOG = next(FIXTURES.glob("logs/*/log.mcap"))
 COMMANDS: dict[str, tuple[int, str]] = {
+    "runs . --since 2026-03 --until 2025-01": (2, "2026-03 comes after --until 2025-01"),
     "chekc s.toml p.toml": (2, "no command 'chekc'. Did you mean 'check'?"),
     "check s.toml": (2, "Missing argument 'PROTOCOL'"),
     "check cal p.toml": (2, "File 'cal' is a directory"),
@@ -367,3 +368,19 @@ def test_every_slip_of_the_list_that_is_a_replacement(bench: Path) -> None:
         old, new = (one.encode().decode("unicode_escape") if "\\" in one else one for one in (old, new))
         Path(target).write_text(replaced(text, old, new))
         told(say("check", scene, protocol), 2, target)
+
+
+STUDY = (FIXTURES / "studies" / "best-spring.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("new", "words"),
+    [
+        ("[0.5, 0.1]", "radius_ratio = [0.5, 0.1]: the lowest value stands first and the highest second: [0.1, 0.5]"),
+        ("[0.1, 5]", "radius_ratio reaches 5: the disk is smaller than the ring, below 1"),
+    ],
+)
+def test_a_slip_in_the_bounds_of_a_study_makes_no_folder(bench: Path, new: str, words: str) -> None:
+    (bench / "st.toml").write_text(replaced(STUDY, "[0.1, 0.5]", new))
+    told(say("design", "st.toml", "--out", "d"), 2, "st.toml", words)
+    assert not (bench / "d").exists()
