@@ -27,8 +27,10 @@ All are in Pa and metres. The film is incompressible; where a program asks for a
 small-strain shear modulus. Branches of a film that takes time: `calibration.film.prony`.
 
 Sources: Abaqus Materials Guide, "Hyperelastic behavior of rubberlike materials"; Ansys Material Reference,
-"Hyperelasticity" (NEO, MOONEY, YEOH, GENT, OGDEN); COMSOL Structural Mechanics Module User's Guide, "Hyperelastic
-Material"; FEBio User Manual, "Uncoupled materials" (incomp neo-Hookean, Mooney-Rivlin, Yeoh, Gent, Ogden).
+"Hyperelasticity" (NEO, MOONEY, YEOH, GENT, OGDEN), and for the order of constants the listings of its Structural
+Analysis Guide, "Hyperelasticity" (NEO: mu, d; OGDEN: mu_1, alpha_1, mu_2, alpha_2, ..., d_1, ...); COMSOL Structural
+Mechanics Module User's Guide, "Hyperelastic Material"; FEBio User Manual, "Uncoupled materials" (incomp neo-Hookean,
+Mooney-Rivlin, Yeoh, Gent, Ogden).
 """
 
 from __future__ import annotations
