@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 LARGEST_STRETCH = 15.0  # no elastomer goes there; a column of percent does
 LEAST_G, LARGEST_G = 1e3, 20e6  # Pa: elastomers lie between
 STRESS_AT_REST = 0.02  # of the largest stress, at stretch 1
+NO_REST = 0.3  # away from stretch 1 the sheet bears stress
 TOE = 0.02  # of the largest stress: until then a specimen hangs slack
 BROKEN = 0.5  # of the largest stress: less than that, with the stretch still rising, is a break
 AGREE = 0.03  # by which stress and force over area, or strain and extension over length, may differ
@@ -434,6 +435,14 @@ def _plausible(name: str, part: Part, findings: Findings) -> bool:
                 "--column stress=NUMBER",
             )
     stretch, stress = part.values["stretch1"], part.values["stress1"]
+    k = int(np.abs(stretch - 1.0).argmin())
+    if abs(stretch[k] - 1.0) > NO_REST and abs(stress[k]) < STRESS_AT_REST * float(np.abs(stress).max()):
+        findings.obstacle(
+            "zero",
+            f"{name}: the stretch begins at {stretch[k]:.4g}, and there is no stress there: is it counted from zero",
+            "--zero displacement=first (or strain=first)",
+            line=int(part.lines[k]),
+        )
     jumps = jumps_of(stretch, stress)
     if jumps:
         line = int(part.lines[jumps[0]])

@@ -358,6 +358,8 @@ def _heading(lead: list[TextRow], width: int, numeric: Sequence[bool], dialect: 
             continue
         if any(dialect.kind(cell) == "N" for cell in given) and not _named(given):
             continue
+        if len(given) == 1 and LABEL.match(fold(given[0])):
+            continue  # the name of the first specimen, below the heading of all
         if len(given) >= max(2, usable // 2):
             labels = lead[k - 1].cells if k and not lead[k - 1].remark and len(lead[k - 1].given) < len(given) else []
             return _Head(_fitted(cells, width), row.line, units, _fitted(labels, width) if labels else [])

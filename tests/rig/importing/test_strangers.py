@@ -87,6 +87,22 @@ def test_a_sheet_is_read_to_the_numbers_that_were_written(tmp_path: Path, text: 
     assert test.kind == "uniaxial"
 
 
+def test_a_position_that_does_not_begin_at_zero_is_asked_for_its_zero(tmp_path: Path) -> None:
+    text = ["Position (mm),Load (N)", *lines("{:.4f},{:.6f}", 52.3 + LENGTH * STRAIN, AREA * MPA)]
+    size = {"area_mm2": AREA, "length_mm": LENGTH}
+    with pytest.raises(ImportRefused, match="--zero displacement=first"):
+        sheets(tmp_path, text, from_words(**size))  # type: ignore[arg-type] # numbers
+    (test,) = sheets(tmp_path, text, from_words(zero=["displacement=first"], **size)).tests  # type: ignore[arg-type]
+    np.testing.assert_allclose(test.stretch1, 1.0 + STRAIN, rtol=1e-9)
+
+
+def test_a_heading_above_the_names_of_specimens_is_that_of_all(tmp_path: Path) -> None:
+    own = lines("{:.4f},{:.6f}", STRAIN, MPA)
+    text = ["Strain,Stress (MPa)", "Specimen: A", *own, "Specimen: B", *lines("{:.4f},{:.6f}", STRAIN, 1.1 * MPA)]
+    read = sheets(tmp_path, text).tests
+    assert [test.name for test in read] == ["Zug1, Specimen: A", "Zug1, Specimen: B"]
+
+
 def test_two_specimens_under_one_heading_stay_two(tmp_path: Path) -> None:
     loop = [*ROWS, *lines("{:.1f},{:.4f},{:.6f}", 15.5 + TIME, STRAIN[::-1], 0.8 * MPA[::-1])]
     again = [*ROWS[:1], *lines("{:.1f},{:.4f},{:.6f}", TIME, STRAIN, 1.01 * MPA)]
