@@ -25,6 +25,7 @@ CHECK_MODES = 6  # of a way that is only looked at
 WAY = (2, 5)  # steps of V^2 to an answer that is there already: so many, and then so many
 WAY_GOAL, WAY_STEPS = 3e-2, 8  # of Newton on that way
 ROUGH = 1e-6  # tolerance on the way
+TIGHT = 1e-8  # that of a wrinkled state which does not settle to a looser one
 
 
 class Ended:
@@ -66,10 +67,11 @@ def solve(
         reached, begin, rest = reached[lost], begin.take(lost), np.flatnonzero(left)
         if len(rest) == 0:
             break
-    if len(reached) and not relaxed:
-        found, _ = settled(
-            problem, reached, tolerance, _in_pieces(problem.take(reached), begin), False, sensitivities, ended
-        )
+    if len(reached):
+        # With folds a tighter tolerance begins with more modes; plain layers ask for short elements.
+        begin = begin if relaxed else _in_pieces(problem.take(reached), begin)
+        least = min(tolerance, TIGHT) if relaxed else tolerance
+        found, _ = settled(problem, reached, least, begin, relaxed, sensitivities, ended)
         answers += found
     done = np.zeros(states, dtype=np.bool_) if relaxed else np.ones(states, dtype=np.bool_)
     for answer in answers:

@@ -155,6 +155,19 @@ def test_the_edge_of_a_wrinkled_zone_is_no_loss_of_convexity_and_its_place_is_in
         assert abs(one.force / found[3].force - 1.0) <= one.error_estimate + found[3].error_estimate
 
 
+def test_a_wrinkled_state_that_few_modes_miss_is_answered_at_every_tolerance() -> None:
+    """Finite elements reach it; from few modes Newton's method did not."""
+    mu = (97643.18595220073, -19706.66788112732, 2.2799639527785134, -3359.9663142161844)
+    alpha = (1.5589107015025991, -1.4518212935716015, 5.32138030197117, -2.9596100475021205)
+    film = Specimen(
+        0.004713513453938472, 0.02, 1.875235593041573e-05, 1.2437070885741517, Material("r", mu, alpha, 3.0)
+    )
+    for tolerance in (1e-4, 1e-6, 1e-8):
+        found = solve(film, 0.01918485560370611, 616.6871445743986, tolerance=tolerance, wrinkling="tension_field")
+        assert found.status is Status.WRINKLED
+        assert found.force == pytest.approx(0.0738718119, rel=1e-8)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("lp", [1.0, 1.2, 1.5, 2.0, 2.5, 3.0])
 @pytest.mark.parametrize("name", sorted(NAMED))
