@@ -47,9 +47,8 @@ class Refit:
 
     def answer(self, question: Ask) -> Advice:
         """The advice; one that says why where there is none."""
-        paths = [*self._earlier, growing(self._log)]
         try:
-            curves, found = self._fit(paths)
+            curves, found = self._fit([*self._earlier, growing(self._log)])
             return self._learner.advise(curves, found, question)
         except (RigError, LogError, DeviceError, ValueError, ArithmeticError) as error:
             return Advice(Kind.FAILED, f"the fit failed: {error}")
