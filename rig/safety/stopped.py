@@ -28,7 +28,8 @@ class Peer:
         if self._stat is None:
             return False
         try:
-            line = os.pread(self._stat, 1024, 0)
+            os.lseek(self._stat, 0, os.SEEK_SET)  # makes the text anew
+            line = os.read(self._stat, 1024)
         except OSError:  # it has ended, which is told otherwise
             return False
         return line.rpartition(b")")[2].split()[:1] == [STOPPED]

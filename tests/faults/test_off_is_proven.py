@@ -19,6 +19,7 @@ from rig.safety.channel import Channel
 from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
 from rig.safety.heartbeat import Heartbeat
 from rig.safety.process import LastWords, Server
+from rig.safety.stopped import Peer
 from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
 from rig.sim.truth import Fault
@@ -132,7 +133,8 @@ class Alone:
         ours, theirs = socket.socketpair()
         self.engine, self._theirs = Channel(ours), Channel(theirs)
         link = self.bench._opened.links["hv"]
-        self.server = Server(scene, scene.hv, link, self._theirs, self.clock)  # type: ignore[arg-type]
+        self.peer = Peer(os.getpid())
+        self.server = Server(scene, scene.hv, link, self._theirs, self.clock, self.peer)  # type: ignore[arg-type]
         self._beats = self._calls = 0
         self.engine.send({"do": "appoint", "gain": 1.0, "fresh": {}})
         self.go(3.0)
@@ -186,6 +188,7 @@ def alone() -> Iterator[Alone]:
     yield rig
     rig.engine.close()
     rig._theirs.close()
+    rig.peer.close()
     rig.bench.close()
 
 

@@ -110,11 +110,15 @@ def test_every_command_of_the_software_can_be_given_again():
 
     from rig.engine import engine
     from rig.replay.verify import commands
+    from rig.run.backend import open_bench
     from rig.safety import guard
+    from rig.scene.scene import load_scene
     from rig.steps import home, rig
 
     written = {("hv", word) for word in re.findall(r'_tell\("(\w+)"', getsource(guard))}
     for module in (home, rig, engine):
         written |= set(re.findall(r'\.command\("(\w+)", "(\w+)"', getsource(module)))
     assert len(written) >= 10
-    assert written <= commands(None).keys()
+    bench = open_bench(load_scene(LOGS.parent / "scenes" / "cone-4mm.toml")[0])
+    assert written <= commands(bench).keys()
+    bench.close()

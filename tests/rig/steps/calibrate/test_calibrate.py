@@ -15,7 +15,6 @@ from rich.console import Console
 from calibration.film.propagation import secant_modulus
 from rig.analysis.certificate_file import certificate_text
 from rig.analysis.film import identify_logs
-from rig.analysis.proposal import MARGIN
 from rig.analysis.sensor_protocols import protocol_text
 from rig.analysis.sensors import Calibration, Lag, calibrate
 from rig.base.certificates import load_certificate
@@ -28,6 +27,7 @@ from rig.protocol.plan import plan
 from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import load_scene
+from rig.steps.places import MARGIN
 from rig.steps.standards import series
 
 FIXTURES = Path(str(files("sim_fixtures")))
