@@ -28,23 +28,24 @@ LONGEST = 65536  # bytes of an answer
 class RefitProcess:
     """An `rig.steps.advisor.Advisor` that asks a process; a context manager.
 
-    One that has died or takes too long is ended, and the next question starts another.
+    One that has died or takes too long is ended, and the next question starts another; so does the first question of
+    another step.
 
     Parameters
     ----------
     experiment : Experiment
-        Of the run; its step `rig.steps.learn.Learn` says what is wanted.
+        Of the run; its steps `rig.steps.learn.Learn` say what is wanted.
     log : Path
         Which the run writes.
     """
 
     def __init__(self, experiment: Experiment, log: Path) -> None:
-        step = next(step for step in experiment.protocol.step if isinstance(step, Learn))
-        self._first = {
+        self._steps = {n: step for n, step in enumerate(experiment.protocol.step, 1) if isinstance(step, Learn)}
+        self._served = min(self._steps)
+        self._run = {
             "log": str(log.resolve()),
             "earlier": [str(one.resolve()) for one in experiment.earlier],
             "scene": experiment.scene_text,
-            "step": step.model_dump(),
         }
         self._in_memory = not experiment.scene.on_real_ports
         self._process: subprocess.Popen[bytes] | None = None
@@ -59,8 +60,9 @@ class RefitProcess:
 
     def ask(self, question: Ask, now: float) -> None:
         """Put a question; the process is started for the first."""
-        if self._waiting:  # for an answer that has not come in time
+        if self._waiting or question.step != self._served:  # an answer has not come in time; another step asks
             self._end()
+        self._served = question.step
         if self._process is None:
             self._start()
         self._asked, self._heard, self._waiting = now, b"", True
@@ -105,7 +107,7 @@ class RefitProcess:
         assert self._process.stdout is not None and self._process.stdin is not None
         os.set_blocking(self._process.stdout.fileno(), False)
         os.set_blocking(self._process.stdin.fileno(), False)
-        self._send(self._first)
+        self._send({**self._run, "step": self._steps[self._served].model_dump()})
 
     def _send(self, line: Mapping[str, Any]) -> None:
         process = self._process

@@ -25,6 +25,8 @@ class Ask:
 
     Attributes
     ----------
+    step : int
+        Of the protocol that asks, from 1.
     number : int
         Of the question, from 1.
     h, voltage : float
@@ -33,6 +35,7 @@ class Ask:
         Time of the rig in this step so far, and what is left of it, the way back taken off.
     """
 
+    step: int
     number: int
     h: float
     voltage: float

@@ -200,7 +200,7 @@ class _Loop:
         self.number += 1
         write_phase(rig, self._action, self._action.kind, "fit", voltage=self._at.voltage, record=True)
         began = rig.clock.now()
-        advisor.ask(Ask(self.number, self._at.h, self._at.voltage, self.spent, self.left), began)
+        advisor.ask(Ask(self._action.step, self.number, self._at.h, self._at.voltage, self.spent, self.left), began)
         while (advice := advisor.answer(rig.clock.now(), lambda: rig.control.count > 0)) is None:
             if rig.clock.now() - began > ANSWER_S:
                 return Advice(Kind.FAILED, f"the fit took longer than {ANSWER_S:.0f} s")

@@ -77,7 +77,7 @@ def test_a_fault_is_no_result(tell: Tell) -> None:
 
 def test_a_breakdown_elsewhere_is_still_a_fault(tell: Tell) -> None:
     story = tell(replace=WEAK, protocol=HEAD + '[[step]]\ndo = "voltage"\nvoltage_V = 1700\n')
-    # By the current or by a voltage that sags below its limit, whichever sample shows it first.
+    # As a breakdown or by the limit of the current, whichever sample shows it first.
     assert story.outcome.status in ("fault", "limit") and not results(story)
 
 

@@ -124,7 +124,7 @@ class Experiment:
             except IdentificationError:
                 self.found = None
             left = self.at_most - self.seconds
-            asked = Ask(self.fits, self.h, self.voltage, self.seconds, left)
+            asked = Ask(1, self.fits, self.h, self.voltage, self.seconds, left)
             advice = self.learner.advise(self.curves, self.found, asked)
             if advice.kind is not Kind.GO:
                 self.charge(0.0)

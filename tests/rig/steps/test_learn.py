@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -254,20 +255,34 @@ def test_a_film_that_breaks_down_ends_it_safely(
 # --- The process that fits
 
 
+def test_each_step_is_served_by_what_it_wants(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    second = '[[step]]\ndo = "learn"\nuntil = "stiffness 2 %"\nat_most_min = 1\n[[step]]\ndo = "return"'
+    path = tmp_path / "protocol.toml"
+    path.write_text(PROTOCOL.replace('[[step]]\ndo = "return"', second), encoding="utf-8")
+    twice = prepare(SCENE, path)
+    told: list[dict[str, Any]] = []
+    monkeypatch.setattr(RefitProcess, "_send", lambda self, line: told.append(dict(line)))
+    with RefitProcess(twice, tmp_path / "none.mcap") as process:
+        process.ask(Ask(4, 1, 0.0, 0.0, 1.0, 50.0), 0.0)
+        process._waiting = False
+        process.ask(Ask(5, 1, 0.0, 0.0, 1.0, 50.0), 1.0)
+    assert [line["step"]["until"] for line in told if "scene" in line] == ["eps_r 1 %", "stiffness 2 %"]
+
+
 @pytest.mark.slow
 def test_a_process_that_dies_is_told_and_the_next_question_has_another(experiment: Experiment, tmp_path: Path) -> None:
     with RefitProcess(experiment, tmp_path / "none.mcap") as process:
         first = process.pid
-        process.ask(Ask(1, 0.0, 0.0, 1.0, 50.0), 0.0)
+        process.ask(Ask(4, 1, 0.0, 0.0, 1.0, 50.0), 0.0)
         assert first is not None
         os.kill(first, signal.SIGKILL)
         told = process.answer(10.0, lambda: False)
         assert told is not None and told.kind is Kind.FAILED and "has ended" in told.reason
-        process.ask(Ask(2, 0.0, 0.0, 1.0, 50.0), 20.0)
+        process.ask(Ask(4, 2, 0.0, 0.0, 1.0, 50.0), 20.0)
         second = process.pid
         assert second not in (None, first)
         told = process.answer(30.0, lambda: False)
         assert told is not None and told.kind is Kind.FAILED and "there is no such file" in told.reason
-        process.ask(Ask(3, 0.0, 0.0, 1.0, 50.0), 40.0)
+        process.ask(Ask(4, 3, 0.0, 0.0, 1.0, 50.0), 40.0)
         assert process.answer(50.0, lambda: True) is None or process.pid == second
     assert process.pid is None
