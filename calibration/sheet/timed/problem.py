@@ -26,6 +26,7 @@ MOST_RATIO = 20.0
 STEP = 1e-4  # relative change of a number for a slope
 FINE = (1, 2, 4, 8)  # steps of time from bin to bin, the first that is good enough
 GOOD = 0.1  # of the deviations: error of the steps of time
+COARSE = 1e-3  # of the largest stress: an error of the steps of time that is told
 
 
 @dataclass(eq=False)
@@ -79,6 +80,8 @@ class TimedProblem:
     def refine(self, x: Array) -> float:
         """Take steps so fine that halving them changes the stresses by less than `GOOD` of their deviations.
 
+        And none of them by more than `COARSE`, where the finest steps reach that.
+
         The error that is left, over the largest stress: four thirds of the change (second order).
         """
         error = math.inf
@@ -89,7 +92,7 @@ class TimedProblem:
             now = self.stress(x)
             change = np.abs(now - before)
             error = float((change / np.repeat(self.largest, self._rows)).max()) * 4.0 / 3.0
-            if float(np.sqrt(np.mean((change / self.sigma) ** 2))) < GOOD:
+            if float(np.sqrt(np.mean((change / self.sigma) ** 2))) < GOOD and error < COARSE:
                 self.fine = fine
                 self._lay()
                 break

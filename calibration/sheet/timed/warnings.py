@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.sheet.judgement import LARGEST_G, LEAST_G
+from calibration.sheet.timed.problem import COARSE
 from calibration.sheet.timed.record import SheetRecord
 from calibration.sheet.timed.result import SheetTrace, TimedFit
 
 LACK = 1.5  # of the misfit, from which on it is told
 BADLY_PREDICTED = 0.05  # of the largest stress: a test that is missed by more is not predicted
-COARSE = 1e-3  # of the largest stress: an error of the steps of time that is told
 
 
 def warnings_of(fit: TimedFit, records: Sequence[SheetRecord], predicted: Sequence[SheetTrace]) -> list[str]:
