@@ -109,7 +109,8 @@ def _tests_of(source: Source) -> list[HomogeneousTest]:
 
 
 def _described(test: HomogeneousTest, how: str) -> str:
-    stress = test.measured
+    stress, time = test.measured, test.history.time if test.history else np.zeros(0)
+    how += f"; with --branches {time.size} rows over {np.ptp(time):.4g} s" if time.size else ""
     return (
         f"{test.name}: {test.stretch1.size} rows, stretch {test.stretch1.min():.4g} to {test.stretch1.max():.4g}, "
         f"nominal stress {stress.min() / 1e3:.4g} to {stress.max() / 1e3:.4g} kPa{how}"
@@ -212,8 +213,9 @@ def _read(source: Source, piece: Piece, kind: str | None, *, first: bool) -> tup
     if len(chosen) < (4 if two else 2):
         return None, ""
     time = Chooser(table, piece.group, source.options, Findings("")).choose("time")
-    chosen += [time] if time is not None and time.unit.name else []
-    part, left_out = read_columns(table, piece.section, chosen, piece.label, source.options, source.findings)
+    timed = [time] if time is not None and time.unit.name else []
+    source.understood.take(timed, "; for --branches only")
+    part, left_out = read_columns(table, piece.section, chosen + timed, piece.label, source.options, source.findings)
     source.understood.leave_out(left_out)
     values = _to_stretch_and_stress(part.values, piece, source.options)
     return replace(part, values=values), how
