@@ -53,9 +53,11 @@ class Relaxed:
             values.append(one)
             first += one.shape[-1]
         table = np.concatenate(values, axis=-1)  # (levels, GRID, columns)
-        for level in table:
+        for k, level in enumerate(table):
             known = np.isfinite(level).all(axis=1)
-            if not known.all():  # beyond the last state: the last one's, as a start
+            if not known.any():  # no state at this voltage: those of the lower one, as a start
+                level[:] = table[k - 1]
+            elif not known.all():  # beyond the last state: the last one's, as a start
                 level[:] = level[known][
                     np.searchsorted(np.flatnonzero(known), np.arange(GRID)).clip(0, known.sum() - 1)
                 ]
@@ -104,16 +106,17 @@ class Motion:
             found = profiles(specimen, grid, level * top, POINTS, tolerance=1e-5)
             logs = np.log(np.stack((found.stretch_1, found.stretch_2), axis=1))
             known = np.isfinite(logs).all(axis=(1, 2))
-            spline = CubicSpline(grid[known], logs[known])
+            if known.sum() > 1:  # else the film has no states at the highest voltage: those at 0 V, as a start
+                spline, last, radius = CubicSpline(grid[known], logs[known]), grid[known][-1], found.R[0]
             part = (share if level else 1.0 - share)[:, None, None]
-            inside = np.minimum(h, grid[known][-1])
+            inside = np.minimum(h, last)
             self.u += part * spline(inside)
             self.by_h += part * spline(inside, 1)
         simpson = np.ones(POINTS)
         simpson[1:-1:2], simpson[2:-1:2] = 4.0, 2.0
         step = math.log(specimen.ring_radius / specimen.disk_radius) / (POINTS - 1) / 3.0
         volume = 2.0 * math.pi * specimen.thickness / specimen.prestretch**2 * step
-        self.weight = volume * simpson * found.R[0] ** 2
+        self.weight = volume * simpson * radius**2
 
     def forces(self, film: Material, t: Array, times: Sequence[float] | Array) -> Array:
         """What branches as stiff as the film add to the force (N), (times, len(t)); exponential rule of order 2."""

@@ -13,12 +13,14 @@ import pytest
 from calibration.film.branches.estimate import with_elastic_error
 from calibration.film.branches.identify import identify_branches
 from calibration.film.branches.record import Record
-from calibration.film.branches.response import Motion
+from calibration.film.branches.response import Motion, Relaxed
 from calibration.film.branches.result import FoundBranch, Spectrum
 from calibration.film.curve import Curve
 from calibration.film.identify import identify
 from calibration.film.result import GOOD, Identification, Quantity
-from model.material.materials import NAMED
+from model.material.materials import NAMED, Material
+from model.membrane.solution import Status
+from model.membrane.solve import solve
 from model.specimen import Specimen
 from tests.calibration.film.independent import secant_modulus
 from tests.calibration.film.shooting import Cone
@@ -91,6 +93,19 @@ def test_what_a_branch_adds_to_first_order_is_what_the_independent_cone_has() ->
     added = motion.forces(film.material, t, [2.0])[0]
     true = (slow.at(t) - elastic.at(t)) / ratio
     assert np.abs(added - true).max() < 0.02 * np.abs(true).max()
+
+
+def test_a_film_that_hangs_slack_at_the_highest_voltage_has_a_response_all_the_same() -> None:
+    """A search comes by such films, and so does a cone predicted from a sheet: what is asked at 0 V is right."""
+    soft = Specimen(4e-3, 20e-3, 40e-6, 1.2, Material("soft", (2e4,), (2.5,), 3.0))
+    assert solve(soft, 6e-3, 5000.0).status is Status.SLACK
+    alone, charged = (Relaxed(soft, 10e-3, volts) for volts in (0.0, 5000.0))
+    h = np.linspace(0.0, 10e-3, 7)
+    assert charged.force(h, np.zeros(7)) == pytest.approx(alone.force(h, np.zeros(7)), rel=1e-12)
+    assert np.isfinite(charged.force(h, np.full(7, 5000.0))).all()
+    still, moved = (Motion(soft, h, np.linspace(0.0, volts, 7)) for volts in (0.0, 5000.0))
+    assert moved.u == pytest.approx(still.u, rel=1e-12)
+    assert np.array_equal(moved.weight, still.weight)
 
 
 def test_an_elastic_fit_imports_nothing_of_branches() -> None:
