@@ -79,7 +79,7 @@ def over_time(spectrum: Spectrum) -> str:
         left.axvspan(low, high, color="#eef3f8", lw=0, label="times that the record can show")
         left.set_xscale("log")
         left.set_xlim(0.3 * low, 3.0 * high)
-        left.set_ylim(bottom=0.0)
+        left.set_ylim(0.0, 1.5 * left.get_ylim()[1])  # room for the legend
         left.set_xlabel("relaxation time / s")
         left.set_ylabel("ratio to the relaxed film")
         left.set_title("(a) branches, 95 % limits")
