@@ -21,7 +21,8 @@ TEMPLATE = (
     STYLE
     + """<h1>A sheet that takes time</h1>
 <p>{{ fit.law.title }}{% if fit.law.series %}, {{ fit.mu|length }} term{{ 's' if fit.mu|length > 1 }}{% endif %},
-{{ fit.spectrum.branches|length }} branches. The law and its numbers are those of the relaxed sheet. {{ fit.law.description }}</p>
+{{ fit.spectrum.branches|length }} branches. The law and its numbers are those of the relaxed sheet.
+{{ fit.law.description }}</p>
 {% for table in tables %}"""
     + TABLE
     + """{% endfor %}
