@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @click.option("--preset", help="The film: parker, vhb-4905, vhb-4910, elastosil-2030, ecoflex-00-30, sylgard-184.")
 @click.option("--disk-radius-mm", type=POSITIVE, help="Radius of the disk.")
 @click.option("--ring-radius-mm", type=POSITIVE, help="Inner radius of the ring.")
-@click.option("--prestretch", type=Number(), help="Stretched over original length; 1 is none.")
+@click.option("--prestretch", type=Number(min=1), help="Stretched over original length; 1 is none.")
 @click.option("--thickness-um", type=POSITIVE, help="Of the film before pre-stretch; default: as sold.")
 @click.option("--name", default="film-1", show_default=True, help="Of this specimen.")
 @click.option("--no-hv", is_flag=True, help="A bench without high voltage.")
