@@ -30,7 +30,7 @@ from rig.panel.queue import queue_of
 from rig.panel.series import Binned, Loop
 
 SAFE_VOLTAGE = 60.0  # V: below it an output counts as off, as in `rig.safety`
-LOOK_S = 0.05  # between two looks at the log
+LOOK_S = 0.08  # between two looks at the log
 QUEUE_S = 5.0  # between two looks at what is done of the campaign
 ASK_S = 0.25  # between two questions to the run
 OLD_S = 1.0  # data older than this are said to be old
