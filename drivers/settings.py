@@ -7,6 +7,7 @@ reference page (``dea-rig keys``), the editor's completion and the error message
 from __future__ import annotations
 
 import socket
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
@@ -88,15 +89,16 @@ class InstrumentSettings(Table):
         """Sensors with the same one get one connection between them, by `open_shared`; None: each has its own."""
         return None
 
-    def open_shared(self, names: Sequence[str]) -> Sequence[ByteLink]:
-        """As `open`, one link for each of the instruments called ``names``, over one connection."""
-        raise NotImplementedError  # each kind of link has its own
+    def open_shared(self, names: Sequence[str]) -> Sequence[ByteLink | FrameLink]:
+        """As `open`, one link for each of the instruments called ``names``; over one connection where they share it."""
+        return [self.open(name) for name in names]
 
     @property
     def two_may_hold(self) -> bool:
         """Whether two processes may have the link at once: one opens it, and the other adopts it or opens it too."""
         return hasattr(socket, "send_fds")
 
+    @abstractmethod
     def open(self, name: str, adopt: Sequence[int] = ()) -> ByteLink | FrameLink:
         """Open the port or bus; sends nothing to the instrument. ``name`` is the instrument's in messages.
 
@@ -107,7 +109,6 @@ class InstrumentSettings(Table):
         drivers.links.link.DeviceError
             It cannot be opened, or somebody else has it.
         """
-        raise NotImplementedError  # each kind of link has its own
 
 
 class SerialSettings(InstrumentSettings):

@@ -72,9 +72,14 @@ def write_report(
     OSError
         When the file cannot be written.
     """
+    write_page(path, render(fit, tests, compared, told))
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a page; the file appears whole or not at all. Raises OSError where it cannot be written."""
     part = path.with_name(f".{path.name}.part")
     try:
-        part.write_text(render(fit, tests, compared, told), encoding="utf-8")
+        part.write_text(text, encoding="utf-8")
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ own keys and its own faults. Every key has a default, so that ``seed = 1`` is a 
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
@@ -89,9 +90,9 @@ class InstrumentTruth(Table):
         """Everything that can go wrong with it."""
         return tuple(kind for kind in SWITCHES if kind not in cls.means_nothing) + cls.more_faults
 
+    @abstractmethod
     def wire(self) -> ByteWire | FrameWire:
         """The wire between it and the host."""
-        raise NotImplementedError  # each kind of wire has its own
 
 
 class LinkTruth(Table):

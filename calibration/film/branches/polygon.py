@@ -66,6 +66,19 @@ def edges_of(length: float, period: float) -> Array:
     return np.array([*kept[1:-1], length])
 
 
+def bin_numbers(t: Array, knots: Array, period: float) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
+    """Of every sample the stretch between ``knots`` (s) and the bin that it is in; and how many bins there are."""
+    part = np.clip(np.searchsorted(knots, t, side="left") - 1, 0, knots.size - 2)
+    number, count = np.empty(t.size, dtype=np.intp), 0
+    for k in np.unique(part):
+        mine = part == k
+        edges = edges_of(knots[k + 1] - knots[k], period)
+        _, number[mine] = np.unique(np.searchsorted(edges, t[mine] - knots[k]), return_inverse=True)
+        number[mine] += count
+        count = int(number[mine].max()) + 1
+    return part, number, count
+
+
 def lines_through(time: Array, mean: Array, segment: NDArray[np.intp], t: Array, number: NDArray[np.intp]) -> Array:
     """The line through neighbouring bins of one stretch, at every sample."""
     slope = np.zeros(time.size)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.polygon import FIRST, edges_of, knots_of, lines_through, through
+from calibration.film.branches.polygon import FIRST, bin_numbers, knots_of, lines_through, through
 from calibration.film.curve import Curve, CurveError
 from calibration.film.reduction import CONTACT_MARGIN
 
@@ -85,16 +85,7 @@ class Record:
         """Means of the forces that are used, carried to the bins' own times by the force of an ``elastic`` film."""
         knots, high, volts = self.history
         rows = np.flatnonzero(self.used & (self.t > knots[0]) & (self.t <= knots[-1]))
-        part = np.clip(np.searchsorted(knots, self.t[rows], side="left") - 1, 0, knots.size - 2)
-        number = np.empty(rows.size, dtype=np.intp)
-        count = 0
-        for k in np.unique(part):
-            mine = part == k
-            since = self.t[rows[mine]] - knots[k]
-            edges = edges_of(knots[k + 1] - knots[k], self.period)
-            _, number[mine] = np.unique(np.searchsorted(edges, since), return_inverse=True)
-            number[mine] += count
-            count = int(number[mine].max()) + 1
+        part, number, count = bin_numbers(self.t[rows], knots, self.period)
         size = np.bincount(number, minlength=count)
 
         def mean(values: Array) -> Array:

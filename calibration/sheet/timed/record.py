@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.polygon import correlation, edges_of, knots_of, lines_through, through
+from calibration.film.branches.polygon import bin_numbers, correlation, knots_of, lines_through, through
 from calibration.sheet.sheet_tests import HomogeneousTest, TestsError
 
 if TYPE_CHECKING:
@@ -107,15 +107,7 @@ class SheetRecord:
     def bins(self) -> Bins:
         """Means of the stresses, one direction after the other."""
         knots, _ = self.polygon
-        part = np.clip(np.searchsorted(knots, self.t, side="left") - 1, 0, knots.size - 2)
-        number = np.empty(self.t.size, dtype=np.intp)
-        count = 0
-        for k in np.unique(part):
-            mine = part == k
-            edges = edges_of(knots[k + 1] - knots[k], self.period)
-            _, number[mine] = np.unique(np.searchsorted(edges, self.t[mine] - knots[k]), return_inverse=True)
-            number[mine] += count
-            count = int(number[mine].max()) + 1
+        part, number, count = bin_numbers(self.t, knots, self.period)
         size = np.bincount(number, minlength=count)
 
         def mean(values: Array) -> Array:

@@ -13,7 +13,7 @@ from calibration.report.figures import STYLES, svg
 from calibration.report.relaxation_figure import over_time
 from calibration.report.sections.base import BADGES, picture
 from calibration.rounding import percent, rounded, stated
-from calibration.sheet.report import STYLE, TABLE
+from calibration.sheet.report import STYLE, TABLE, write_page
 from calibration.sheet.timed.predict import ConePrediction
 from calibration.sheet.timed.result import SheetTrace, TimedFit
 
@@ -48,12 +48,7 @@ def write_report(path: Path, fit: TimedFit, cones: Sequence[ConePrediction], tol
     OSError
         When the file cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(render(fit, cones, told), encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_page(path, render(fit, cones, told))
 
 
 def render(fit: TimedFit, cones: Sequence[ConePrediction], told: Sequence[str]) -> str:
