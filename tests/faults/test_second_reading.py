@@ -153,8 +153,15 @@ def test_air_is_logged_and_ends_no_run(tell: Tell) -> None:
 # The rules themselves ---------------------------------------------------------------------------------------------
 
 
+class NoMonitor(MonitorSettings):
+    """A table whose instrument is never opened: the rules are asked about samples made here."""
+
+    def open(self, role: Any, wire: Any, clock: Any) -> Any:
+        raise AssertionError("no test of the rules opens an instrument")
+
+
 def second(**keys: Any) -> SecondReading:
-    table = MonitorSettings(driver="any", quantity="voltage", **{"rate_Hz": 5.0, "lag_s": 0.5, **keys})
+    table = NoMonitor(driver="any", quantity="voltage", **{"rate_Hz": 5.0, "lag_s": 0.5, **keys})
     return SecondReading("monitor", table, 0.2, 300.0, 1080.0)
 
 
