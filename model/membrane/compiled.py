@@ -291,9 +291,10 @@ def hangs_slack(specimen: Specimen, h: float, voltage: float) -> bool | None:
 
 
 def warm() -> None:
-    """Make what a first state that is followed from rest needs at `solve`'s own tolerance: it takes some 50 ms."""
+    """Make what any state needs at `solve`'s own tolerance: it takes some 0.2 s, which a loop has no time for."""
     if _solver() is not None:
-        _task(1e-8, False, False, TIERS[1])
+        for most in TIERS:
+            _task(1e-8, False, False, most)
 
 
 @lru_cache(maxsize=1)

@@ -54,9 +54,12 @@ class Table:
     to_modes: Array  # (N, Q): modes of a function whose derivative is given
 
 
+gauss = lru_cache(maxsize=128)(np.polynomial.legendre.leggauss)  # points and weights
+
+
 @lru_cache(maxsize=64)
 def _barycentric_weights(points: int) -> Array:
-    xi, weight = np.polynomial.legendre.leggauss(points)
+    xi, weight = gauss(points)
     return np.asarray((-1.0) ** np.arange(points) * np.sqrt((1.0 - xi * xi) * weight))
 
 
@@ -79,7 +82,7 @@ MORE_POINTS = 3  # Gauss points than modes: with fewer the quadrature's error ou
 def table(modes: int) -> Table:
     """Tables for ``modes`` integrated Legendre modes, made once."""
     points = modes + MORE_POINTS
-    xi, weight = np.polynomial.legendre.leggauss(points)
+    xi, weight = gauss(points)
     k = np.arange(1, modes + 1).astype(np.float64)
     legendre = np.polynomial.legendre.legvander(xi, points)
     half = np.full(points, 0.5)

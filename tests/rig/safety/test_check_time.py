@@ -78,3 +78,15 @@ def test_the_time_of_a_check(count: int) -> None:
         slow = [min(spent(*all_[i]) for _ in range(3)) for i in np.flatnonzero(times > 2e-3).tolist()]
         assert count < 1_000_000 or np.quantile(times, 0.999) < 0.3e-3, name
         assert max(slow, default=0.0) < 2e-3, name
+
+
+def test_no_state_makes_tables_between_two_turns_of_the_loop() -> None:
+    """They take a tenth of a second: made with the limits, whatever is asked afterwards. The state needs the finest."""
+    compiled._task.cache_clear()
+    compiled._table.cache_clear()
+    scene, _ = load_scene(SCENES / "no-hv.toml")
+    guarded = FilmLimits(scene.specimen.specimen(), Limits.of(scene))
+    before = compiled._table.cache_info().misses
+    with suppress(LimitError):
+        guarded.check(3.3390324425018963e-3, 2293.7787919353746, "Test")
+    assert compiled._table.cache_info().misses == before
