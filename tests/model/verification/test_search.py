@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import pytest
 
-from model.verification.search import Report, run
-
-
-def assert_agreed(report: Report, states: int) -> None:
-    assert report.states == states
-    assert report.statuses == []
-    assert report.forces == []
-    assert report.truth == []
-    assert report.answered > 0.5 * states
-    assert report.unstable > 0.1 * states  # it is about the end of branches
+from model.verification.search import run
 
 
 @pytest.mark.slow
 def test_fifty_states_around_loss_of_convexity() -> None:
-    assert_agreed(run(50, seed=1, truth=0), 50)
+    report = run(50, seed=1, truth=0)
+    assert report.states == 50
+    assert report.differences == []
+    assert report.answered > 25
+    assert report.unstable > 5  # it is about the end of branches
 
 
 @pytest.mark.long
-def test_few_states_around_loss_of_convexity_disagree() -> None:
-    """The whole search is a command that takes a day:
-    ``python -m model.verification.search --states 20000 --truth 500``.
-
-    Known today: of 350 states one force differs, by 2.1 stated errors; of 250 others two. None
-    disagrees with the finite elements, which is what must never happen.
-    """
-    report = run(150, seed=500, truth=3)
-    assert report.states == 150
-    assert len(report.statuses) + len(report.forces) <= 3
-    assert report.truth == []
+def test_few_hundred_states_around_loss_of_convexity_and_some_against_finite_elements() -> None:
+    """All of them: ``python -m model.verification.search --states 20000 --truth 500``, some 25 minutes."""
+    report = run(400, seed=500, truth=10)
+    assert report.followed == 10
+    assert report.differences == []
