@@ -46,7 +46,10 @@ class NotResolved(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Charging:
-    """Samples of one run in the order of time, SI units: time, voltage, current, displacement, whether it ramps."""
+    """Samples of one run in the order of time, SI units: time, voltage, current, displacement, whether it ramps.
+
+    ``run`` is its name, by which the curves of the same run are found.
+    """
 
     specimen: Specimen
     t: Array
@@ -54,6 +57,7 @@ class Charging:
     current: Array
     h: Array
     ramping: NDArray[np.bool_]
+    run: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,17 @@ class Known:
     current_gain: float | None = None
     cable_F: float = 0.0
     cable_uncertainty_F: float | None = None
+
+    @property
+    def cable_error(self) -> float:
+        """Standard uncertainty (F) of the capacitance beside the film, assumed where nobody stated it."""
+        stated = self.cable_uncertainty_F
+        return max(ASSUMED_CABLE * self.cable_F, ASSUMED_CABLE_F) if stated is None else stated
+
+    @property
+    def gain_error(self) -> float:
+        """Relative standard uncertainty of the current, assumed where nobody stated it."""
+        return ASSUMED_CURRENT_GAIN if self.current_gain is None else self.current_gain
 
 
 @dataclass(frozen=True)
@@ -129,10 +144,14 @@ class Permittivity:
 
 @dataclass(frozen=True)
 class ByCharge:
-    """The permittivity by the charge beside that by the force alone: value and standard uncertainty, if it has one."""
+    """The permittivity by the charge alone, beside that by the force alone: value and standard uncertainty.
 
-    charge: Permittivity
+    ``charge`` is None where the supply cannot resolve it; ``left_out`` says why.
+    """
+
+    charge: Permittivity | None
     by_force: tuple[float, float] | None
+    left_out: str = ""
 
 
 def charge_as_json(found: Permittivity | ByCharge) -> dict[str, Any]:
@@ -159,21 +178,19 @@ def permittivity(data: Sequence[Charging], known: Known) -> Permittivity:
     """
     if not any(np.isfinite(one.current).any() for one in data):
         raise NotResolved("this supply cannot resolve it: it does not measure its current")
-    rows = [_rows(one) for one in data]
+    rows = [rows_of(one) for one in data]
     on_ramps = sum(int(np.count_nonzero(one.rises)) for one in rows)
     if on_ramps < FEWEST:
         raise NotResolved(
             f"only {on_ramps} samples of the current lie on rises of the voltage; at least {FEWEST} are needed: use a "
             "slower ramp, more voltages or a faster supply"
         )
-    stated = known.cable_uncertainty_F
-    cable_error = max(ASSUMED_CABLE * known.cable_F, ASSUMED_CABLE_F) if stated is None else stated
     specimen = data[0].specimen
     for _ in range(PASSES):  # the shape under voltage depends a little on the permittivity itself
-        fit = _fit(specimen, rows, known.cable_F, cable_error)
+        fit = _fit(specimen, rows, known.cable_F, known.cable_error)
         if fit.value >= 1.0:
             specimen = specimen.with_material(replace(specimen.material, eps_r=fit.value))
-    resolution = _resolution(np.concatenate([one.current for one in rows]))
+    resolution = resolution_of(np.concatenate([one.current for one in rows]))
     charging = float(np.mean(np.concatenate([one.current[one.rises] for one in rows])))
     parts = {"current noise": fit.error, "cable": fit.cable_error}
     if resolution > 0:
@@ -185,8 +202,7 @@ def permittivity(data: Sequence[Charging], known: Known) -> Permittivity:
             f"{resolution * 1e9:.3g} nA with a noise of {fit.noise * 1e9:.3g} nA, leave {resolved:.0%} of the "
             "permittivity. A faster ramp draws more current"
         )
-    gain = ASSUMED_CURRENT_GAIN if known.current_gain is None else known.current_gain
-    parts |= {"current gain": gain * fit.value, "voltage gain": known.voltage_gain * fit.value}
+    parts |= {"current gain": known.gain_error * fit.value, "voltage gain": known.voltage_gain * fit.value}
     parts |= _dimensions(specimen, rows, known, fit.value)
     assumed = {} if known.current_gain is not None else {"current gain": ASSUMED_CURRENT_GAIN}
     return Permittivity(
@@ -204,7 +220,7 @@ def permittivity(data: Sequence[Charging], known: Known) -> Permittivity:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class Rows:
     """What goes into the fit of one run: samples on rises, and at rest; ``slope`` is dV/dt, 0 at rest."""
 
     t: Array
@@ -215,7 +231,8 @@ class _Rows:
     rises: NDArray[np.bool_]
 
 
-def _rows(one: Charging) -> _Rows:
+def rows_of(one: Charging) -> Rows:
+    """The samples of a run that lie on steady rises of the voltage, and at rest."""
     t, v = one.t, one.voltage
     good = np.isfinite(t) & np.isfinite(v) & np.isfinite(one.current) & np.isfinite(one.h)
     before, after = np.zeros_like(v), np.zeros_like(v)
@@ -239,7 +256,7 @@ def _rows(one: Charging) -> _Rows:
         near_ramp[:-k] |= one.ramping[k:]
     rests = inner & ~near_ramp & ~moves
     use = rises | rests
-    return _Rows(t[use], v[use], one.current[use], one.h[use], np.where(rises, slope, 0.0)[use], rises[use])
+    return Rows(t[use], v[use], one.current[use], one.h[use], np.where(rises, slope, 0.0)[use], rises[use])
 
 
 @dataclass(frozen=True)
@@ -252,7 +269,7 @@ class _Fit:
     rest: Array  # coefficients of V, V^3, 1
 
 
-def _fit(specimen: Specimen, rows: Sequence[_Rows], cable: float, cable_error: float) -> _Fit:
+def _fit(specimen: Specimen, rows: Sequence[Rows], cable: float, cable_error: float) -> _Fit:
     """Least squares, with the capacitance of the cable within what is known of it."""
     rate = np.concatenate([_charge_rate(specimen, one) for one in rows])
     slope = np.concatenate([one.slope for one in rows])
@@ -290,10 +307,10 @@ def _fit(specimen: Specimen, rows: Sequence[_Rows], cable: float, cable_error: f
     )
 
 
-def _charge_rate(specimen: Specimen, rows: _Rows) -> Array:
+def _charge_rate(specimen: Specimen, rows: Rows) -> Array:
     """d(cV)/dt (F V/s for a permittivity of 1) at every sample: c and its slope by Chebyshev series at each place."""
     found = np.zeros_like(rows.voltage)
-    for h, mine in _places(rows):
+    for h, mine in places_of(rows):
         volts = rows.voltage[mine]
         series = _charge(specimen, h, float(np.max(volts)))
         found[mine] = series.deriv()(volts) * rows.slope[mine]
@@ -314,7 +331,7 @@ def _charge(specimen: Specimen, h: float, most: float) -> np.polynomial.Chebyshe
     return np.polynomial.Chebyshev.fit(nodes[known], values[known], len(nodes[known]) - 1)
 
 
-def _places(rows: _Rows) -> list[tuple[float, NDArray[np.bool_]]]:
+def places_of(rows: Rows) -> list[tuple[float, NDArray[np.bool_]]]:
     """Displacements at which there are rises, and which samples belong to each."""
     groups: list[tuple[float, NDArray[np.bool_]]] = []
     left = rows.rises.copy()
@@ -328,9 +345,9 @@ def _places(rows: _Rows) -> list[tuple[float, NDArray[np.bool_]]]:
     return groups
 
 
-def _dimensions(specimen: Specimen, rows: Sequence[_Rows], known: Known, value: float) -> dict[str, float]:
+def _dimensions(specimen: Specimen, rows: Sequence[Rows], known: Known, value: float) -> dict[str, float]:
     """What uncertain dimensions, displacements and the film's law do to the value, by the capacitance they change."""
-    places = [(h, float(np.max(one.voltage[mine]))) for one in rows for h, mine in _places(one)]
+    places = [(h, float(np.max(one.voltage[mine]))) for one in rows for h, mine in places_of(one)]
     places = places[:: max(len(places) // 4, 1)]
     believed = specimen.material
 
@@ -355,7 +372,7 @@ def _dimensions(specimen: Specimen, rows: Sequence[_Rows], known: Known, value: 
     return {name: part for name, part in parts.items() if math.isfinite(part) and part > 0.0}
 
 
-def _resolution(current: Array) -> float:
+def resolution_of(current: Array) -> float:
     """Smallest step between readings (A) where they come in few values; 0 where they show no step."""
     values = np.unique(current)
     if len(values) < 2 or len(values) > 0.5 * len(current):
@@ -363,12 +380,12 @@ def _resolution(current: Array) -> float:
     return float(np.min(np.diff(values)))
 
 
-def _by_displacement(specimen: Specimen, rows: Sequence[_Rows], fit: _Fit) -> list[Capacitance]:
+def _by_displacement(specimen: Specimen, rows: Sequence[Rows], fit: _Fit) -> list[Capacitance]:
     """d(CV)/dV at each place where the voltage rose, measured and by the fit."""
     found = []
     for one in rows:
         rate = _charge_rate(specimen, one)
-        for h, mine in _places(one):
+        for h, mine in places_of(one):
             slope = one.slope[mine]
             leak = _rest(fit, rows, one.voltage[mine])
             measured = float(np.sum((one.current[mine] - leak) * slope) / np.sum(slope**2))
@@ -378,7 +395,7 @@ def _by_displacement(specimen: Specimen, rows: Sequence[_Rows], fit: _Fit) -> li
     return found
 
 
-def _rest(fit: _Fit, rows: Sequence[_Rows], volts: Array) -> Array:
+def _rest(fit: _Fit, rows: Sequence[Rows], volts: Array) -> Array:
     top = max(max(float(np.max(np.abs(one.voltage))) for one in rows), 1.0)
     x = volts / top
     powers = (x, np.ones_like(x)) if len(fit.rest) == 2 else (x, x**3, np.ones_like(x))

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.electrical.rows import Currents
 from calibration.film.curve import Curve
 from calibration.film.held_out import held_out
 from calibration.film.minima import (
@@ -41,6 +42,7 @@ from calibration.film.reduction import Selection, select
 from calibration.film.result import Identification
 from calibration.film.summary import summarise
 from calibration.film.suspects.registry import fittable
+from calibration.film.suspects.softening import KEY as SOFTENING
 from model.material.law import Law
 from model.material.materials import Material
 from model.membrane.solve import Wrinkling
@@ -52,6 +54,7 @@ __all__ = ["IdentificationError", "compare", "identify", "secant_modulus"]
 PASSES = 5
 MOST_NODES = 36
 SEARCH_TOLERANCE = 1e-6  # of the membrane's force, relative, while the minima are sought
+CHARGE_OFF = 0.1  # largest error of the linear capacitances, in standard deviations of a row
 INTERPOLATION = 0.1  # largest estimated error of interpolation, in standard deviations of what a node carries
 
 
@@ -70,6 +73,7 @@ def identify(
     reach: float = math.inf,
     along: Sequence[str] = (),
     fixed_stretch: tuple[float, float] | None = None,
+    currents: Currents | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Identification:
     """Fit a film to force-displacement curves.
@@ -105,6 +109,9 @@ def identify(
     fixed_stretch : (float, float), optional
         Meridional and hoop stretch of the quantity ``stiffness_fixed``; if it is left out, 1.25 times the pre-stretch,
         and the pre-stretch.
+    currents : Currents, optional
+        What the supply's current says of the capacitance of the same film, in the same runs: data beside the forces.
+        Where a run has several curves their softening is fitted along: it is what the charge tells from permittivity.
     provenance : mapping, optional
         Whatever identifies the data (hashes of logs, names of files), as plain JSON values; kept in the result.
 
@@ -129,6 +136,8 @@ def identify(
     strange = [key for key in along if key not in choice]
     if strange:
         raise IdentificationError(f"cannot fit {', '.join(strange)} along; what can be is {', '.join(sorted(choice))}")
+    if currents is not None and _repeated(curves):
+        along = [*along, SOFTENING]
     asked = [choice[key] for key in dict.fromkeys(along)]
 
     if "eps_r" in held:
@@ -140,7 +149,15 @@ def identify(
     for number in range(PASSES):
         if number == 0:
             coarse = Problem(
-                curves, selections, terms, material, tolerance=SEARCH_TOLERANCE, wrinkling=wrinkling, along=asked
+                curves,
+                selections,
+                terms,
+                material,
+                tolerance=SEARCH_TOLERANCE,
+                wrinkling=wrinkling,
+                along=asked,
+                currents=currents,
+                coarse=True,
             )
             points = starting_materials(material, terms, starts, seed, held, negative_exponents)
             points += [spread(one, terms) for one in near if law.series]
@@ -156,13 +173,14 @@ def identify(
             wrinkling=wrinkling,
             compliance=best.compliance,
             along=asked,
+            currents=currents,
         )
         best = polish(problem, best, held) or best
         material = problem.film(best.x)
         previous, selections = selections, select(curves, material, wrinkling)
         if nodes < MOST_NODES and _too_coarse(problem, best.x):
             nodes = min(MOST_NODES, nodes * 3 // 2)
-        elif number > 0 and _same(previous, selections):
+        elif number > 0 and _same(previous, selections) and _settled(problem, material):
             # The first pass took its weights and corrections from the search: always make a second one.
             break
     else:
@@ -180,8 +198,9 @@ def identify(
             "profiles": profiles,
             "fixed": held,
             "wrinkling": wrinkling,
-            "along": [*along],
+            "along": [kind.key for kind in asked],
             "fixed_stretch": None if fixed_stretch is None else list(fixed_stretch),
+            **({"charge": True} if currents is not None else {}),
         },
         "software": {name: importlib.metadata.version(name) for name in ("dea-rig", "lmfit", "numpy", "scipy")},
     }
@@ -193,6 +212,17 @@ def _too_coarse(problem: Problem, x: Array) -> bool:
     most = max(block.samples for block in problem.blocks) / problem.nodes.shape[1]
     noise = np.array([problem.curves[i].force_noise for i in problem.active]) / math.sqrt(max(1.0, most))
     return bool((problem.interpolation_error(problem.states(x)) > INTERPOLATION * noise).any())
+
+
+def _settled(problem: Problem, film: Material) -> bool:
+    """Whether the capacitances, linear about the film that the pass began with, are those of the film found."""
+    return problem.charge is None or problem.charge.off(film) < CHARGE_OFF
+
+
+def _repeated(curves: Sequence[Curve]) -> bool:
+    """Whether some run has two curves."""
+    runs = [curve.run for curve in curves if curve.usable.any()]
+    return len(set(runs)) < len(runs)
 
 
 def _same(before: Sequence[Selection], after: Sequence[Selection]) -> bool:

@@ -54,7 +54,7 @@ class _Seen:
     uncertainty: float  # inf where the parameters do all that it does
 
 
-class _Left:
+class Left:
     """What the fit leaves over of residual rows, and ``C^-1`` there, with the errors that are stated and not fitted."""
 
     def __init__(self, problem: Problem, x: Array, free: NDArray[np.bool_]) -> None:
@@ -76,14 +76,14 @@ class _Left:
 
 def beyond(problem: Problem, x: Array, free: NDArray[np.bool_]) -> float:
     """Chi-square of the residuals beyond what gains and dimensions do within their stated uncertainties."""
-    left = _Left(problem, x, free)
+    left = Left(problem, x, free)
     visible = left.of(left.residual)
     return float(visible @ left.weighed(visible))
 
 
 def suspects(problem: Problem, x: Array, free: NDArray[np.bool_]) -> list[Suspect]:
     """The imperfections that this data could show, most probable first."""
-    left, context = _Left(problem, x, free), problem.context(x)
+    left, context = Left(problem, x, free), problem.context(x)
     found = []
     for kind in kinds():
         if kind.key and kind.key in context.fitted:

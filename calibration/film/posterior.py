@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.electrical.rows import Currents
 from calibration.film.curve import Curve
 from calibration.film.problem import IdentificationError, Problem
 from calibration.film.propagation import secant_modulus, sorted_terms
@@ -41,6 +42,7 @@ def posterior(
     steps: int = MOST_STEPS,
     seed: int = 0,
     progress: Callable[[float, float, str], None] = lambda done, total, label: None,
+    currents: Currents | None = None,
 ) -> Posterior:
     """Sample the posterior around an identification of ``curves``, until the chain is long enough.
 
@@ -53,6 +55,8 @@ def posterior(
     seed : int
     progress : callable
         Told steps done, steps expected, and a label.
+    currents : Currents, optional
+        As they were fitted along.
 
     Raises
     ------
@@ -70,7 +74,14 @@ def posterior(
     settings = found.provenance.get("settings", {})
     along = [fittable()[key] for key in settings.get("along", [])]
     problem = Problem(
-        curves, selections, found.terms, found.material, wrinkling=found.wrinkling, compliance=compliance, along=along
+        curves,
+        selections,
+        found.terms,
+        found.material,
+        wrinkling=found.wrinkling,
+        compliance=compliance,
+        along=along,
+        currents=currents,
     )
     best = problem.vector(found.material)
     held = settings.get("fixed", {})

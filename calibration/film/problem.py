@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.electrical.rows import Currents
+from calibration.film.charged import KINDS, ChargeModel
 from calibration.film.coordinates import Coordinates
 from calibration.film.curve import Curve
 from calibration.film.differences import DIMENSIONS, common, contrast_weights, contrasts, parts
@@ -52,7 +54,7 @@ class Nuisance:
     in each of its rows, is in ``weights``.
     """
 
-    kind: str  # force_zero, displacement_zero, lag, compliance or one of DIMENSIONS
+    kind: str  # force_zero, displacement_zero, lag, compliance, one of DIMENSIONS or of KINDS (of the current)
     run: str
     prior: float
     rows: tuple[int, ...]
@@ -86,8 +88,9 @@ class Problem:
     ``g_n = mu_n alpha_n / (2 G_0) > 0``, which keeps the film stable at any stretch. ``terms`` counts for a series
     only. Nuisances are in units of their priors. Each part of a curve is a row of ``nodes``, and ``active`` names the
     curve of each row. The rig gives way by the force of the material ``at``, where its ``compliance`` (m/N, beyond
-    that believed) holds the disk. ``solved`` counts the membrane states that were computed: rows times nodes for an
-    evaluation, whatever the number of samples.
+    that believed) holds the disk. ``currents`` are data beside the forces, whose residuals follow theirs; ``coarse``
+    leaves out what the law does to the capacitance. ``solved`` counts the membrane states that were computed: rows
+    times nodes for an evaluation, whatever the number of samples.
     """
 
     def __init__(
@@ -103,6 +106,8 @@ class Problem:
         wrinkling: Wrinkling = "plain",
         compliance: float = 0.0,
         along: Sequence[Kind] = (),
+        currents: Currents | None = None,
+        coarse: bool = False,
     ) -> None:
         self.curves = curves
         self.selections = selections
@@ -121,6 +126,7 @@ class Problem:
         self.coordinates = here = Coordinates.of(at, terms, self.electric)
         self.law, self.moduli, self.film_numbers = here.law, here.moduli, here.film_numbers
         self.parameters, self.material, self.scale = here.parameters, at, here.scale
+        self.charge = None if currents is None or not self.electric else ChargeModel(currents, at, whole=not coarse)
         self.nodes = np.array([chebyshev_nodes(part.low, part.high, nodes) for _, part in self.pieces])
         self.voltage = np.array([reference_voltage(curves[i], part.used) for i, part in self.pieces])
         self.nuisances = self._nuisances()
@@ -179,6 +185,8 @@ class Problem:
             found += self._contrasts(dimension)
         runs = dict.fromkeys(self.curves[i].run for i in self.active)
         found += [Nuisance(key, run, kind.usual, ()) for key, kind in self.along.items() for run in runs]
+        if self.charge is not None:
+            found += [Nuisance(kind, "the supply", prior, ()) for kind, prior in self.charge.currents.priors.items()]
         return found
 
     @property
@@ -204,9 +212,14 @@ class Problem:
         return [Nuisance(dimension, f"contrast {k + 1}", 1.0, rows, one) for k, one in enumerate(weights)]
 
     @property
+    def force_rows(self) -> int:
+        """Residuals that come from forces, the first ones; those of the charge follow."""
+        return self._target.size
+
+    @property
     def data_rows(self) -> int:
         """Residuals that come from data; one for each nuisance follows."""
-        return self._target.size
+        return self.force_rows + (0 if self.charge is None else self.charge.size)
 
     def film(self, x: Array) -> Material:
         """The material of a parameter vector."""
@@ -251,36 +264,63 @@ class Problem:
     def project(self, at_nodes: Array) -> Array:
         """Weighted residual rows of changes of the force at the nodes, (..., rows, nodes, P); nuisances get 0."""
         rows = [root @ at_nodes[..., row, :, :] for root, row in zip(self.roots, self.block_rows, strict=True)]
-        nothing = np.zeros((*at_nodes.shape[:-3], len(self.nuisances), at_nodes.shape[-1]))
+        more = self.data_rows - self.force_rows + len(self.nuisances)
+        nothing = np.zeros((*at_nodes.shape[:-3], more, at_nodes.shape[-1]))
         return np.concatenate([*rows, nothing], axis=-2)
 
     def evaluate(self, points: Array, *, slopes: bool = True) -> Evaluation:
         """Residuals and Jacobians of many parameter vectors (S, P), their membrane states all solved together."""
-        count, data = len(points), self.data_rows
+        count, data, forces = len(points), self.data_rows, self.force_rows
         solved = self._solve([self.film(x) for x in points], points, slopes=slopes)
         force = solved.force.copy()
         for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
             if nuisance.kind == "force_zero":
                 force[:, nuisance.rows] += (points[:, k] * nuisance.prior)[:, None, None]
         residual = self.project(force[..., None])[..., 0]
-        residual[:, :data] -= self._target
+        residual[:, :forces] -= self._target
         for k, late in self._late.items():
-            residual[:, :data] += points[:, self.film_parameters + k, None] * late
+            residual[:, :forces] += points[:, self.film_parameters + k, None] * late
         residual[:, data:] = points[:, self.film_parameters :]
         jacobian = np.zeros((count, residual.shape[1], points.shape[1]))
         if slopes:
             by = self.by_parameters(points[:, None, None], *(solved.by[name] for name in ("mu", "alpha", "eps_r")))
             for k, nuisance in enumerate(self.nuisances, start=self.film_parameters):
-                if k - self.film_parameters not in self._late:
+                if nuisance.rows and k - self.film_parameters not in self._late:
                     by[..., k][:, list(nuisance.rows)] = self._by_nuisance(nuisance, solved)
             jacobian = self.project(by)
             for k, late in self._late.items():
-                jacobian[:, :data, self.film_parameters + k] = late
+                jacobian[:, :forces, self.film_parameters + k] = late
             jacobian[:, data:, self.film_parameters :] = np.eye(len(self.nuisances))
+        if self.charge is not None:
+            self._add_charge(self.charge, points, residual, jacobian if slopes else None)
         answered = np.asarray(np.isfinite(force).all(axis=(1, 2)))
         residual[~answered] = INVALID_RESIDUAL
         jacobian[~answered] = 0.0
         return Evaluation(residual, jacobian, answered, solved)
+
+    def _add_charge(self, charge: ChargeModel, points: Array, residual: Array, jacobian: Array | None) -> None:
+        """Put the rows of the charge into residuals and Jacobian."""
+        mine = slice(self.force_rows, self.data_rows)
+        values = {n.kind: points[:, k] * n.prior for k, n in enumerate(self.nuisances, self.film_parameters)}
+        shift = np.zeros((len(points), len(charge.currents.places)))
+        zeros = []
+        for k, one in enumerate(self.nuisances, self.film_parameters):
+            if one.kind == "displacement_zero":
+                here = np.array([place.run == one.run for place in charge.currents.places])
+                zeros.append((k, one.prior * here))
+                shift += points[:, k, None] * one.prior * here
+        errors = {kind: size for kind, size in values.items() if kind in KINDS}
+        found = charge.evaluate([self.film(x) for x in points], errors, shift)
+        residual[:, mine] = found.residual
+        if jacobian is None:
+            return
+        rows = self.by_parameters(points[:, None], found.by_mu, found.by_alpha, found.by_eps_r)
+        for k, one in enumerate(self.nuisances, self.film_parameters):
+            if one.kind in KINDS:
+                rows[..., k] = found.by_kind[one.kind] * one.prior
+        for k, size in zeros:
+            rows[..., k] = np.einsum("spm,p->sm", found.by_h, size)
+        jacobian[:, mine] = rows
 
     def samples(self, row: int, x: Array, states: States) -> tuple[Array, Array, Array]:
         """Of the used samples of a row: residual (measured minus model, N), its deviation, displacement."""
@@ -336,7 +376,7 @@ class Problem:
                 raise IdentificationError(f"{kind.name}: these data have nothing to do with it; do not fit it along")
             for k, one in enumerate(self.nuisances):
                 if one.kind == key:
-                    found[k] = one.prior * shapes[0].rows[: self.data_rows] * (owner == one.run)
+                    found[k] = one.prior * shapes[0].rows[: self.force_rows] * (owner == one.run)
         return found
 
     def _along_at(self, row: int, x: Array) -> Array:

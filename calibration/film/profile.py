@@ -19,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.film.charged import KINDS
 from calibration.film.problem import Problem
 from calibration.film.propagation import NUISANCES, Covariance, secant, shear_slopes
 from calibration.film.result import Quantity, verdict
@@ -191,5 +192,5 @@ def widened(quantity: Quantity, ends: tuple[float, float], misfit: float) -> Qua
 
 def _random(quantity: Quantity, misfit: float) -> float:
     """Linear standard uncertainty from noise and zeros, enlarged by the misfit."""
-    parts = (quantity.budget.get(part, 0.0) for part in ("noise", *(kind.replace("_", " ") for kind in NUISANCES)))
-    return math.hypot(*parts) * math.sqrt(misfit)
+    kinds = ("noise", "current_noise", *NUISANCES, *KINDS)
+    return math.hypot(*(quantity.budget.get(kind.replace("_", " "), 0.0) for kind in kinds)) * math.sqrt(misfit)

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.film.charged import KINDS
 from calibration.film.differences import DIMENSIONS
 from calibration.film.misfit import likely
 from calibration.film.problem import Problem
@@ -211,8 +212,10 @@ class Propagation:
         """Independent parts of the standard uncertainty of a function of x with this gradient."""
         rows = gradient @ self.covariance.response
         data = self.problem.data_rows
-        parts = {"noise": float(np.linalg.norm(rows[:data]))}
-        for kind in (*NUISANCES, *self.problem.along):
+        parts = {"noise": float(np.linalg.norm(rows[: self.problem.force_rows]))}
+        if self.problem.charge is not None:
+            parts["current noise"] = float(np.linalg.norm(rows[self.problem.force_rows : data]))
+        for kind in (*NUISANCES, *KINDS, *self.problem.along):
             mine = [data + k for k, nuisance in enumerate(self.problem.nuisances) if nuisance.kind == kind]
             if mine:
                 parts[self.label(kind)] = float(np.linalg.norm(rows[mine]))
@@ -343,7 +346,7 @@ def state(
             value=float(x[k] * one.prior),
             uncertainty=math.hypot(*propagation.budget(slope).values()),
             prior=one.prior,
-            unit=problem.along[one.kind].unit if one.kind in problem.along else NUISANCES[one.kind],
+            unit=problem.along[one.kind].unit if one.kind in problem.along else (NUISANCES | KINDS)[one.kind],
         )
     nuisance |= _differences(propagation, x)
     return Statement(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.electrical.agreement import Charged
 from calibration.rounding import two_digits
 from model.material.materials import Material
 from model.membrane.solve import Wrinkling
@@ -151,6 +152,7 @@ class Stiffness:
 SIGNIFICANT = 0.01  # probability below which misfit is not put down to chance
 # Factor and unit in which an amplitude is shown.
 SHOWN = {"1": (100.0, "%"), "m/N": (1e6, "um/N"), "N": (1e3, "mN"), "m": (1e6, "um"), "s": (1e3, "ms")}
+SHOWN |= {"F": (1e12, "pF"), "A": (1e9, "nA")}
 
 
 @dataclass(frozen=True)
@@ -335,6 +337,8 @@ class Identification:
     elastic_error : dict of str to float
         By how much (relative, to first order) ``stiffness`` and ``eps_r`` are off because the film takes time and was
         fitted as elastic; empty where the data do not look like it.
+    charge : Charged or None
+        What the current that charges the film says beside its force, where it was data.
     """
 
     material: Material
@@ -373,6 +377,7 @@ class Identification:
     measurement: Measurement | None = None
     spectrum: Spectrum | None = None
     elastic_error: dict[str, float] = field(default_factory=dict)
+    charge: Charged | None = None
 
     @property
     def terms(self) -> int:
@@ -512,6 +517,7 @@ class Identification:
             ],
             **({"spectrum": self.spectrum.to_dict()} if self.spectrum is not None else {}),
             **({"elastic_error": self.elastic_error} if self.elastic_error else {}),
+            **({"charge": self.charge.to_dict()} if self.charge is not None else {}),
             **({"posterior": self.posterior.to_dict()} if self.posterior is not None else {}),
             "warnings": self.warnings,
             "advice": self.advice,

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
+from calibration.electrical.agreement import AGREE
+from calibration.film.agreement import charged, judged
 from calibration.film.identifiability import advice
 from calibration.film.measurement import assumed_parts, most_useful
 from calibration.film.minima import MOST_STEPS, SAME_MINIMUM, Fit
@@ -83,12 +85,14 @@ def summarise(
         aims = targets(problem, stated.stretch, held)
         found = intervals(problem, x, problem.bounds(x), fit.varied, quantities, aims, misfit)
         quantities.update({name: widened(quantities[name], ends, misfit) for name, ends in found.items()})
+    charge = charged(problem, x, seen, stated.nuisance)
     suspected = likely(doubts)
     quantities.update(doubted(quantities, stated.unseen, doubts, suspected))
+    quantities = judged(quantities, charge)
     curves = _curve_results(problem, x)
     used_curves = [problem.curves[i] for i in dict.fromkeys(problem.active)]
     used = sum(curve.used for curve in curves)
-    reduced = problem.residual(x)[: problem.data_rows]
+    reduced = problem.residual(x)[: problem.force_rows]
     prior = problem.residual(x)[problem.data_rows :]
     chi_square = float(problem.inflation * (reduced @ reduced) + prior @ prior) + sum(b.floor for b in problem.blocks)
     effective = used / problem.correlation_time
@@ -125,8 +129,9 @@ def summarise(
         warnings=[],
         advice=[] if held else advice(problem.curves, problem.film(x), stated.quantities, reach),
         provenance=provenance,
-        assumed=assumed_parts(used_curves),
+        assumed=assumed_parts(used_curves) | _assumed_current(problem),
         measurement=most_useful(quantities, used_curves),
+        charge=charge,
     )
     if misfit > WRONG_MODEL:
         lost = {
@@ -146,6 +151,12 @@ def summarise(
     if looks_viscous(doubts):
         result = replace(result, quantities={name: _viscous(one) for name, one in result.quantities.items()})
     return replace(result, warnings=[*_warnings(result, problem, fit), *notes])
+
+
+def _assumed_current(problem: Problem) -> dict[str, float]:
+    """The gain of the current, where nobody stated how well it is known."""
+    known = None if problem.charge is None else problem.charge.currents.known
+    return {} if known is None or known.current_gain is not None else {"current gain": known.gain_error}
 
 
 def looks_viscous(found: Sequence[Suspect]) -> bool:
@@ -288,6 +299,8 @@ def _warnings(result: Identification, problem: Problem, fit: Fit) -> list[str]:
             "but a wrong model has errors that no uncertainty covers"
         )
     by_name = {suspect.name: suspect for suspect in result.suspects}
+    if result.charge is not None and result.charge.verdict != AGREE:
+        words.append(result.charge.words)
     if result.likely:
         named = " or ".join(by_name[name].words for name in result.likely)
         apart = "; these data cannot tell them apart" if len(result.likely) > 1 else ""

@@ -47,6 +47,9 @@ def systematic_rows(problem: Problem, x: Array) -> dict[str, Array]:
         if relative.any():
             change = states.force if scales == "force" else states.by[scales] * _size(problem, scales)
             found[part] = problem.project((relative * change)[..., None])[:, 0]
+            if problem.charge is not None and scales in problem.charge.systematic:
+                # One specimen on one rig: what its curves say of it, its charge does too.
+                found[part][problem.force_rows : problem.data_rows] += relative[0] * problem.charge.systematic[scales]
     tilted = np.array([stiffening(problem.curves[i]) for i in problem.active])[:, None]
     if tilted.any():
         found["eccentricity"] = problem.project((tilted * states.force)[..., None])[:, 0]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.electrical.agreement import Charged
 from calibration.film.curve import Curve
 from calibration.film.identify import secant_modulus
 from calibration.film.reduction import Selection, reference_voltage
@@ -179,6 +180,34 @@ def stiffness(identification: Identification, truth: Material | None) -> str:
             ax.legend(loc="upper left")
 
     return svg(draw, width=8.4, height=3.2)
+
+
+def capacitance(found: Charged) -> str:
+    """Measured and modelled d(CV)/dV of film and cable over the displacement, and their difference below."""
+
+    def draw(figure: Any) -> None:
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        order = np.argsort([one.h for one in found.capacitances])
+        places = [found.capacitances[k] for k in order]
+        h = np.array([one.h for one in places]) * 1e3
+        measured, fitted, error = (
+            np.array([getattr(one, name) for one in places]) * 1e12
+            for name in ("measured", "fitted", "standard_uncertainty")
+        )
+        colour, marker, _ = STYLES[0]
+        upper.plot(h, fitted, "--", color=STYLES[1][0], marker="x", ms=5, lw=1.2, label="force and charge together")
+        upper.errorbar(h, measured, error, fmt=marker, color=colour, ms=4, capsize=2, lw=0.9, label="measured")
+        upper.set_ylabel("d(CV)/dV / pF")
+        upper.legend(loc="upper left")
+        lower.axhline(0.0, color="#777777", lw=0.8)
+        lower.errorbar(
+            h, 100.0 * (measured / fitted - 1.0), 100.0 * error / fitted, fmt=marker, color=colour, ms=4, capsize=2,
+            lw=0.9,
+        )  # fmt: skip
+        lower.set_ylabel("measured less fit / %")
+        lower.set_xlabel("displacement h / mm")
+
+    return svg(draw, width=5.4, height=4.2)
 
 
 def _styles(curves: Sequence[Curve]) -> dict[float, tuple[str, str, Any]]:

@@ -49,7 +49,7 @@ def write_report(
     comparison : sequence of Identification, optional
         The same data with other numbers of Ogden terms (`calibration.film.identify.compare`).
     charge : ByCharge, optional
-        The permittivity by the charge, where it is held at that.
+        The permittivity by the charge alone, where it was asked for.
 
     Raises
     ------

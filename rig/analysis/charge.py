@@ -34,6 +34,15 @@ def permittivity_of(paths: Sequence[Path]) -> Permittivity:
     DataError
         No supply, several specimens, or currents that cannot resolve it; says which.
     """
+    data, known = charging_of(paths)
+    try:
+        return permittivity(data, known)
+    except NotResolved as error:
+        raise DataError(f"{paths[0]}: {error}.") from None
+
+
+def charging_of(paths: Sequence[Path]) -> tuple[list[Charging], Known]:
+    """Currents in the logs of one specimen, and what is known beside them; errors as of `permittivity_of`."""
     logs = [read_log(path) for path in paths]
     scenes = [_scene(log) for log in logs]
     names = sorted({scene.specimen.name for scene in scenes})
@@ -42,10 +51,7 @@ def permittivity_of(paths: Sequence[Path]) -> Permittivity:
     for log, scene in zip(logs, scenes, strict=True):
         if scene.hv is None or "/hv/sample" not in log.topics:
             raise DataError(f"{log.path}: its scene has no [hv] instrument, so there is no current.")
-    try:
-        return permittivity([_charging(*one) for one in zip(logs, scenes, strict=True)], _known(logs[0], scenes[0]))
-    except NotResolved as error:
-        raise DataError(f"{paths[0]}: {error}.") from None
+    return [_charging(*one) for one in zip(logs, scenes, strict=True)], _known(logs[0], scenes[0])
 
 
 def _scene(log: Log) -> Scene:
@@ -67,6 +73,7 @@ def _charging(log: Log, scene: Scene) -> Charging:
         np.where(flags & HVFlag.ON.value, table["current_A"][order], np.nan),
         _displacement(log, t),
         (flags & HVFlag.RAMPING.value) != 0,
+        run=log.path.name,
     )
 
 

@@ -63,7 +63,7 @@ class Found:
     notes: list[str]
     comparison: list[Identification] = field(default_factory=list)
     spreads: dict[str, Spread] = field(default_factory=dict)
-    charge: ByCharge | None = None  # where the permittivity is that of the charge
+    charge: ByCharge | None = None  # where the charge was asked for
     scene_texts: dict[str, str] = field(default_factory=dict)  # beside those of the runs: scenes given with tables
 
 
@@ -87,7 +87,7 @@ def identify_logs(
     ``posterior`` adds Markov chains, which take a minute or more and tell ``progress``. ``branches`` fits so many
     Maxwell branches along, or as many as pay, from the whole histories of the runs. ``wrinkled`` is "left-out" or
     "tension-field". Other ``settings`` are those of `calibration.film.identify.identify`: ``fixed``,
-    ``negative_exponents``, ``along``, ``fixed_stretch``.
+    ``negative_exponents``, ``along``, ``fixed_stretch``, ``currents``.
 
     Raises
     ------
@@ -221,7 +221,8 @@ def identify_curves(
         if posterior:
             from calibration.film.posterior import posterior as sample
 
-            identification = replace(identification, posterior=sample(curves, identification, progress=progress))
+            chains = sample(curves, identification, progress=progress, currents=options.get("currents"))
+            identification = replace(identification, posterior=chains)
     except UnknownParameter as error:
         raise ConfigError(f"--fix: {error}.") from None
     except (CurveError, IdentificationError) as error:
@@ -423,7 +424,7 @@ def _as_json(found: Found) -> str:
             {name: one.to_dict()[name] for name in ("terms", "aicc", "bic", "held_out")} for one in found.comparison
         ]
     if found.charge is not None:
-        values["charge"] = charge_as_json(found.charge)
+        values["by_charge_alone"] = charge_as_json(found.charge)
     if found.spreads:
         values["between_specimens"] = {name: one.to_dict() for name, one in found.spreads.items()}
     return json.dumps(values, indent=2, allow_nan=False) + "\n"

@@ -108,6 +108,7 @@ def _film(record: Mapping[str, Any], result: Mapping[str, Any]) -> tuple[list[In
     options += ["--wrinkled", "tension-field"] if settings["wrinkling"] == "tension_field" else []
     options += [word for name, value in settings["fixed"].items() for word in ("--fix", f"{name}={value!r}")]
     options += [word for key in settings["along"] for word in ("--along", key)]
+    options += ["--permittivity", "charge"] if settings.get("charge") else []
     options += ["--negative-exponents"] if settings["negative_exponents"] else []
     options += ["--branches", str(settings["branches"])] if "branches" in settings else []
     options += ["--profiles"] if settings["profiles"] else []

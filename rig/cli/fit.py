@@ -56,7 +56,7 @@ LEAST_SHARE = 0.01  # of a variance, for a line in the budget on screen
     type=click.Choice(["force", "charge"]),
     default="force",
     show_default=True,
-    help="By what: with charge the current that charges one film says it, whatever the film's stiffness does.",
+    help="By what: with charge the currents of the logs are data beside the forces; softening is fitted along.",
 )
 @click.option(
     "--branches",

@@ -10,6 +10,7 @@ from calibration.film.suspects.base import Context, Kind, Shape
 
 NAME = "film that softens from one curve to the next"
 FIRST = "film that is stiffer in the first curve than later"
+KEY = "softening"
 REMEDY = "measure the curve at the first voltage once more at the end"
 
 
@@ -36,4 +37,4 @@ def _softening(context: Context) -> Sequence[Shape]:
     return shapes
 
 
-SUSPECTS = [Kind(NAME, "1", 1, 0.03, REMEDY, _softening, key="softening")]
+SUSPECTS = [Kind(NAME, "1", 1, 0.03, REMEDY, _softening, key=KEY)]

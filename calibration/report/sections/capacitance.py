@@ -1,48 +1,58 @@
-"""The permittivity by the charge: budget, capacitances against the model, leakage."""
+"""The charge beside the force: the capacitance against the fit of both, what each says alone, leakage."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from calibration.report.sections.base import ReportData, Section, Table
+from calibration.electrical.charge import Permittivity
+from calibration.report import figures
+from calibration.report.sections.base import ReportData, Section, Table, picture
 from calibration.rounding import percent, stated
 
 
 def context(data: ReportData) -> Mapping[str, Any] | None:
-    """Three tables and a sentence, where the permittivity is that of the charge."""
+    """A picture, tables and sentences, where the charge was asked for."""
     if data.charge is None:
         return None
-    found = data.charge.charge
+    joint, alone, by_force = data.identification.charge, data.charge.charge, data.charge.by_force
+    if joint is None:
+        return {"left_out": data.charge.left_out, "joint": None, "alone": None}
+    capacitances = [
+        [f"{c.h * 1e3:.3f}", f"{c.voltage:.0f}", both(c.measured * 1e12, c.standard_uncertainty * 1e12),
+         f"{c.fitted * 1e12:.4g}", f"{100.0 * (c.measured / c.fitted - 1.0):+.2f}"]
+        for c in joint.capacitances
+    ]  # fmt: skip
+    heads = [">displacement / mm", ">mean voltage / V", ">measured / pF", ">fit / pF", ">measured less fit / %"]
+    return {
+        "left_out": "",
+        "joint": joint,
+        "words": joint.words[0].upper() + joint.words[1:],
+        "image": picture(figures.capacitance(joint)),
+        "noise": f"{joint.noise * 1e9:.3g}",
+        "resolution": f"{joint.resolution * 1e9:.3g}",
+        "capacitances": Table(heads, capacitances, "d(CV)/dV of film and cable, leakage taken off"),
+        "alone": None if alone is None else both(alone.value, alone.standard_uncertainty),
+        "by_force": None if by_force is None else both(*by_force),
+        "tables": [] if alone is None else _alone(alone),
+    }
+
+
+def _alone(found: Permittivity) -> list[Table]:
+    """The budget of the permittivity by the charge alone, and leakages."""
     parts = sorted(found.budget.items(), key=lambda item: -item[1])
     budget = [
         [f"{name} (assumed, not stated)" if name in found.assumed else name, percent(part / found.value)]
         for name, part in parts
     ]
-    capacitances = [
-        [f"{c.h * 1e3:.3f}", f"{c.voltage:.0f}", both(c.measured * 1e12, c.standard_uncertainty * 1e12),
-         f"{c.fitted * 1e12:.4g}"]
-        for c in found.capacitances
-    ]  # fmt: skip
     leakages = [
         [f"{leak.h * 1e3:.3f}", f"{leak.voltage:.0f}", f"{leak.field * 1e-6:.3g}",
          both(leak.current * 1e9, leak.standard_uncertainty * 1e9), f"{leak.duration:.1f}"]
         for leak in found.leakages
     ]  # fmt: skip
-    by_force = data.charge.by_force
-    leakage_heads = [">displacement / mm", ">voltage / V", ">field / V/um", ">current / nA", ">rest / s"]
-    return {
-        "value": both(found.value, found.standard_uncertainty),
-        "by_force": None if by_force is None else both(*by_force),
-        "cable": f"{found.cable * 1e12:.3g}",
-        "parts": Table(["part", ">relative"], budget, "Uncertainty of the permittivity by the charge"),
-        "capacitances": Table(
-            [">displacement / mm", ">mean voltage / V", ">measured / pF", ">model / pF"],
-            capacitances,
-            "d(CV)/dV of film and cable, and by the model with this permittivity",
-        ),
-        "leakages": Table(leakage_heads, leakages, "Leakage: what is left of the current at rest"),
-    }
+    tables = [Table(["part", ">relative"], budget, "Uncertainty of the permittivity by the charge alone")]
+    heads = [">displacement / mm", ">voltage / V", ">field / V/um", ">current / nA", ">rest / s"]
+    return [*tables, Table(heads, leakages, "Leakage: what is left of the current at rest")] if leakages else tables
 
 
 def both(value: float, uncertainty: float) -> str:
@@ -50,13 +60,23 @@ def both(value: float, uncertainty: float) -> str:
     return " ± ".join(stated(value, uncertainty))
 
 
-SECTION = Section(
-    "capacitance",
-    55,
-    context,
-    "<h2>Permittivity by the charge</h2>"
-    "<p>The current that charges the film while the voltage rises gives the relative permittivity {{ value }} "
-    "(k = 1), with {{ cable }} pF of cable and output beside the film. No force enters: a film that softens does not "
-    "change it.{% if by_force %} By the force alone it would be {{ by_force }}.{% endif %}</p>"
-    "{{ table(parts) }}{{ table(capacitances) }}{% if leakages.rows %}{{ table(leakages) }}{% endif %}",
-)
+TEMPLATE = """
+<h2>Force and charge</h2>
+{% if joint is none %}
+<p>The charge was left out, and the fit is by the force alone: {{ left_out }}.</p>
+{% else %}
+<p>The current that charges the film while the voltage rises was data beside the force: {{ joint.samples }} readings
+with a noise of {{ noise }} nA, read in steps of {{ resolution }} nA. {{ words }}.</p>
+<figure>
+<img src="{{ image }}" alt="Measured d(CV)/dV against displacement with the fit, and their difference in per cent">
+<figcaption>Capacitance of film and cable by the charge, against the fit of force and charge. Bars: one standard
+uncertainty by the noise of the current.</figcaption>
+</figure>
+{{ table(capacitances) }}
+{% if alone %}<p>The relative permittivity by the charge alone is {{ alone }} (k = 1){% if by_force %}; by the force
+alone, if the film did not soften, {{ by_force }}{% endif %}.</p>{% endif %}
+{% for one in tables %}{{ table(one) }}{% endfor %}
+{% endif %}
+"""
+
+SECTION = Section("capacitance", 55, context, TEMPLATE)

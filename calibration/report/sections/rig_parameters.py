@@ -8,6 +8,7 @@ from typing import Any
 from calibration.report.sections.base import ReportData, Section, Table
 
 UNITS = {"N": ("mN", 1e3), "m": ("µm", 1e6), "s": ("ms", 1e3), "m/N": ("µm/N", 1e6), "1": ("%", 1e2)}
+UNITS |= {"F": ("pF", 1e12), "A": ("nA", 1e9)}
 
 
 def context(data: ReportData) -> Mapping[str, Any] | None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from calibration.electrical.agreement import SOFTENED
 from rig.analysis.charge import permittivity_of
 from rig.analysis.charged_film import identify_with_charge
-from rig.analysis.film import write_results
+from rig.analysis.film import identify_logs, write_results
 from rig.base.errors import DataError
 from rig.cli.app import main
 from rig.log import schema
@@ -56,6 +58,18 @@ def softened(path: Path, out: Path, share: float) -> Path:
     zero = next(m.fields["value"] for m in log.messages("/reference") if m.fields["name"] == "force_zero")
     swept = [(m.fields["t_s"], m.fields["voltage_V"]) for m in log.messages("/phase") if m.fields["record"]]
     begins = [t for k, (t, volts) in enumerate(swept) if k and volts != swept[k - 1][1]]
+
+    def soften(fields: dict[str, Any]) -> None:
+        left = (1.0 - share) ** sum(t <= fields["t_s"] for t in begins)
+        fields["reading"] = zero + (fields["reading"] - zero) * left
+        fields["force_N"] *= left
+
+    return changed(path, out, "/force/sample", soften)
+
+
+def changed(path: Path, out: Path, topic: str, change: Callable[[dict[str, Any]], None]) -> Path:
+    """The same log with other values in the messages of a topic."""
+    log = read_log(path)
     with LogWriter(out) as copy:
         for attachment in log.attachments.values():
             copy.attach(attachment.name, attachment.media_type, attachment.data)
@@ -67,10 +81,8 @@ def softened(path: Path, out: Path, share: float) -> Path:
                 continue
             channel, _, log_ns, about_ns, payload = message
             fields = schema.decode(channel.topic, payload)
-            if channel.topic == "/force/sample":
-                left = (1.0 - share) ** sum(t <= fields["t_s"] for t in begins)
-                fields["reading"] = zero + (fields["reading"] - zero) * left
-                fields["force_N"] *= left
+            if channel.topic == topic:
+                change(fields)
             copy.write(channel.topic, fields, log_ns, about_ns)
         copy.finish(log.outcome or {})
     return out
@@ -80,19 +92,42 @@ def softened(path: Path, out: Path, share: float) -> Path:
 def test_softening_moves_the_permittivity_by_the_force_and_not_that_by_the_charge(swept: Path, tmp_path: Path) -> None:
     soft = softened(swept, tmp_path / "soft.mcap", 0.03)
     found = identify_with_charge([soft], terms=1)
-    assert found.charge is not None and found.charge.by_force is not None
+    assert found.charge is not None and found.charge.by_force is not None and found.charge.charge is not None
+    both = found.identification.charge
+    assert both is not None
     eps_r = found.identification.quantities["eps_r"]
-    assert abs(eps_r.value - TRUTH) < 2 * eps_r.uncertainty < 0.3
+    assert abs(eps_r.value - TRUTH) < eps_r.uncertainty < 0.15
     by_force, error = found.charge.by_force
     assert by_force - TRUTH > 2 * error  # what the charge is for
-    assert "the film has softened" in found.notes[-1]
-    shear = found.identification.quantities["stiffness"]
-    assert shear.budget["permittivity by charge"] > 0
-    assert shear.uncertainty == pytest.approx(np.sqrt(sum(part**2 for part in shear.budget.values())), rel=0.05)
+    assert both.verdict == SOFTENED and both.plain.significant
+    assert both.softened is not None and both.softened[0] == pytest.approx(0.03, abs=2 * both.softened[1])
+    shares = [eps_r.share(part) for part in ("noise", "current noise", "current gain", "thickness")]
+    assert min(shares) > 0.0 and sum(eps_r.share(part) for part in eps_r.budget) == pytest.approx(1.0, abs=0.05)
     write_results(found, tmp_path / "fit.json", tmp_path / "report.html")
-    stated = json.loads((tmp_path / "fit.json").read_text())["charge"]
-    assert stated["charge"]["value"] == eps_r.value and stated["by_force"][0] == by_force
-    assert "Permittivity by the charge" in (tmp_path / "report.html").read_text()
+    stated = json.loads((tmp_path / "fit.json").read_text())
+    assert stated["charge"]["verdict"] == SOFTENED and stated["by_charge_alone"]["by_force"][0] == by_force
+    assert stated["charge"]["softening_per_curve"][0] == both.softened[0] and stated["provenance"]["settings"]["charge"]
+    assert len(stated["charge"]["capacitances"]) == len(both.capacitances) > 0
+    page = (tmp_path / "report.html").read_text()
+    assert "Force and charge" in page and "d(CV)/dV against displacement" in page
+
+
+@pytest.mark.slow
+def test_a_supply_that_cannot_resolve_its_current_leaves_the_fit_as_without(swept: Path, tmp_path: Path) -> None:
+    coarse = changed(swept, tmp_path / "coarse.mcap", "/hv/sample", _in_steps_of_10_uA)
+    found = identify_with_charge([coarse], terms=1)
+    without = identify_logs([coarse], terms=1)
+    assert found.identification.charge is None
+    assert found.identification.quantities == without.identification.quantities
+    assert "cannot resolve it" in found.notes[0] and "by the force alone" in found.notes[0]
+    write_results(found, tmp_path / "fit.json", tmp_path / "report.html")
+    stated = json.loads((tmp_path / "fit.json").read_text())
+    assert "cannot resolve" in stated["by_charge_alone"]["left_out"] and "charge" not in stated
+    assert "The charge was left out" in (tmp_path / "report.html").read_text()
+
+
+def _in_steps_of_10_uA(fields: dict[str, Any]) -> None:
+    fields["current_A"] = round(fields["current_A"] / 1e-5) * 1e-5
 
 
 @pytest.mark.slow
