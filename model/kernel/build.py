@@ -22,8 +22,9 @@ ZIGLANG = "ziglang==0.17.1"
 SECONDS = 600.0  # for one step; a download of 100 MB on a slow line is the longest
 
 # No digit may depend on the machine or on what the compiler would like to reorder: no -ffast-math, no contraction to
-# fused operations, one fixed level of the processor in place of -march=native.
-COMMON = ("-O3", "-std=c99", "-ffp-contract=off", "-fno-math-errno", "-Wall", "-shared")
+# fused operations, one fixed level of the processor in place of -march=native. Without -fno-trapping-math a loop that
+# chooses between two numbers does not become a vector.
+COMMON = ("-O3", "-std=c99", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-shared")
 LEVEL = {"x86_64": "x86-64-v2", "amd64": "x86-64-v2"}  # elsewhere the compiler's own, which is plain
 TRIAL = "#include <math.h>\n#include <stdint.h>\nint64_t trial(double x) { return (int64_t)expm1(x); }\n"
 

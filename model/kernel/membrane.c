@@ -4,6 +4,7 @@
    relaxed energy where it does not; every other state is left to the methods for arrays (LEFT_TO_OTHERS). Each state is
    solved by itself with memory of its own on the stack, so that nothing depends on the others. */
 #include "from_rest.h"
+#include "several.h"
 #include "tension_field.h"
 
 #ifdef _WIN32
@@ -12,6 +13,9 @@
 #define EXPORT __attribute__((visibility("default")))
 #endif
 
+enum {
+    BLOCK = 64 /* states that are under way together */
+};
 #define TWO_PI 6.28318530717958647693
 #define SOFTENING 0.35
 #define FLAT_HEIGHT 1e-9 /* h/b at which the limit of the flat film is solved */
@@ -19,7 +23,7 @@
 /* A film in SI units: _Film of model/membrane/compiled.py. */
 typedef struct {
     double disk_radius, ring_radius, thickness, prestretch, shear_modulus, eps_r, permittivity;
-    Law law;
+    FilmLaw law;
 } Film;
 
 /* Derivatives of the force in SI units. */
@@ -44,14 +48,6 @@ typedef struct {
     double natural[MOST_ELEMENTS][MOST_POINTS];
 } Kept;
 
-/* What all states of a call share: _Task of model/membrane/compiled.py. */
-typedef struct {
-    const Table *tables[MOST_MODES + 1]; /* one of so many modes at that place, or none */
-    int64_t first_modes[3];              /* to begin with, for films up to the spans 2.4, 3.1 and 4 */
-    int64_t relaxed, sensitivities;
-    double tolerance;
-} Task;
-
 static double sign_of(double x) { return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : 0.0; }
 
 static int is_positive(double x) { return x > 0.0 && x < INFINITY; }
@@ -62,26 +58,26 @@ static int is_film(const Film *film) {
            is_positive(film->shear_modulus) && is_positive(film->eps_r) && is_positive(film->permittivity);
 }
 
-/* The state in dimensionless form. */
-static void pose(const Film *film, double h, double voltage, Problem *problem) {
+/* The state in dimensionless form; returns whether it makes sense, and is one for the kernel. */
+static int pose(const Film *film, double h, double voltage, Posed *posed) {
+    if (!is_film(film) || !(fabs(h) < INFINITY) || !(fabs(voltage) < INFINITY)) return 0;
     double field = voltage / film->thickness;
-    problem->law = film->law;
-    for (int64_t k = 0; k < film->law.moduli; k++) problem->law.mu[k] = film->law.mu[k] / film->shear_modulus;
-    problem->field = film->permittivity * (field * field) / film->shear_modulus;
-    problem->log_prestretch = log_of(film->prestretch);
-    problem->span = log_of(film->ring_radius / film->disk_radius);
-    problem->height = h == 0.0 ? FLAT_HEIGHT : fabs(h) / film->ring_radius;
-    problem->mechanical = problem->electric = problem->relaxed = 0;
+    posed->law = film->law;
+    for (int64_t k = 0; k < film->law.moduli; k++) posed->law.mu[k] = film->law.mu[k] / film->shear_modulus;
+    posed->field = film->permittivity * (field * field) / film->shear_modulus;
+    posed->log_prestretch = log_of(film->prestretch);
+    posed->span = log_of(film->ring_radius / film->disk_radius);
+    posed->height = h == 0.0 ? FLAT_HEIGHT : fabs(h) / film->ring_radius;
+    return posed->span > 0.0 && posed->span <= LONGEST && is_positive(posed->height);
 }
 
-/* Whether the film, stretched like a straight cone both ways, would push outwards: no tension can hold it. */
-static int is_slack(Problem *problem) {
-    double cone = problem->height / -expm1_of(-problem->span);
-    double log = problem->log_prestretch + 0.5 * log1p_of(cone * cone);
-    Stress law;
-    if (problem->field == 0.0) return 0;
-    stress_at(problem, log, log, &law);
-    return law.t1[0] < 0.0;
+static Problem problem_of(const Posed *posed) {
+    const FilmLaw *law = &posed->law;
+    Problem problem = {{law->kind, law->moduli, law->shapes, {0.0}, {0.0}}, posed->field, posed->log_prestretch,
+                       posed->span, posed->height, yes(), 0, 0, 0};
+    memcpy(problem.law.mu, law->mu, sizeof law->mu);
+    memcpy(problem.law.alpha, law->alpha, sizeof law->alpha);
+    return problem;
 }
 
 /* The answer in SI units. */
@@ -145,6 +141,11 @@ static int64_t place_all(const Film *film, Problem *problem, double h, double vo
     return wrinkled ? WRINKLED : TAUT;
 }
 
+static int is_folded(const Extremes *x) { return !(x->hoop >= ROUND_OFF_TENSION * x->meridional); }
+
+/* Whether there may be another branch near. */
+static int is_doubtful(const Extremes *x) { return !(x->meridional > 0.0) || !(x->softening <= SOFTENING); }
+
 /* A state that is wrinkled by the plain equations, at the points `at`. */
 static int64_t wrinkled_answer(const Task *task, const Film *film, Problem *problem, double h, double voltage,
                                Iterate *found, const Grid *grid, const State *state, Answer *out, Kept *kept) {
@@ -157,7 +158,7 @@ static int64_t wrinkled_answer(const Task *task, const Film *film, Problem *prob
     if (status != WRINKLED) return status;
     Solved solved = {cut.elements, cut.grid, at, cut.folded};
     extremes(problem, &solved, found->lam, &x);
-    if (!(x.meridional > 0.0) || !(x.softening <= SOFTENING)) return LEFT_TO_OTHERS; /* soft ones are followed, all */
+    if (is_doubtful(&x)) return LEFT_TO_OTHERS; /* soft ones are followed, all */
     int64_t placed = place_all(film, problem, h, voltage, &x, found, modes_of(&cut), 1, out);
     if (task->sensitivities) {
         Derivatives d;
@@ -175,14 +176,8 @@ static int64_t plain_answer(const Task *task, const Film *film, Problem *problem
     int wrinkled = x->hoop < ROUND_OFF_TENSION * x->meridional;
     int64_t placed = place_all(film, problem, h, voltage, x, found, grid->table->modes, wrinkled, out);
     if (task->sensitivities) {
-        Reduced system;
-        Step by_height;
-        Derivatives d = {{0.0}, {0.0}, 0.0, 0.0, 0.0, 0.0};
-        reduce(grid, state->w, at, &system);
-        factor(grid->table->modes, system.coupling, system.give, system.matrix, system.diagonal);
-        tangent(grid, &system, &by_height);
-        d.height = by_height.lam;
-        add_derivatives(problem, grid, state->w, at, 0, found->lam, by_height.dc, by_height.dw, by_height.lam, &d);
+        Derivatives d;
+        derivatives_of(problem, grid, state, at, found->lam, &d);
         place_slopes(film, h, voltage, &d, out);
     }
     if (kept) keep_plain(grid, state, kept);
@@ -209,37 +204,71 @@ static int64_t followed_answer(const Task *task, const Film *film, Problem *prob
     return plain_answer(task, film, problem, h, voltage, &x, &found, &grid, &state, &at, out, kept);
 }
 
+/* What follows from the status that `refine` gave a state after its `found->steps`. */
+static int64_t continued(const Task *task, const Film *film, Problem *problem, double h, double voltage, int slack,
+                         int64_t status, Iterate *found, const Grid *grid, const State *state, Answer *out,
+                         Kept *kept) {
+    Points at;
+    Extremes x;
+    if (status == FOLDED) return wrinkled_answer(task, film, problem, h, voltage, found, grid, state, out, kept);
+    if (status == UNSETTLED) return followed_answer(task, film, problem, h, voltage, slack, found->steps, out, kept);
+    if (status != TAUT) return status;
+    evaluate(problem, grid, state, NULL, &at);
+    Solved solved = {1, grid, &at, NULL};
+    extremes(problem, &solved, found->lam, &x);
+    if (task->relaxed && is_folded(&x))
+        return wrinkled_answer(task, film, problem, h, voltage, found, grid, state, out, kept);
+    int doubtful = is_doubtful(&x);
+    if (doubtful && x.meridional > 0.0)
+        doubtful = !connected(problem, task->tables[CHECK_MODES], grid, state, found->lam);
+    if (doubtful) return followed_answer(task, film, problem, h, voltage, slack, found->steps, out, kept);
+    return plain_answer(task, film, problem, h, voltage, &x, found, grid, state, &at, out, kept);
+}
+
 /* One state. Returns its status; `out` has numbers where that is TAUT or WRINKLED. */
 static int64_t answer(const Task *task, const Film *film, double h, double voltage, Answer *out, Kept *kept) {
-    Problem problem;
+    Posed posed;
     Grid grid;
     State state;
     Iterate found;
-    Points at;
-    Extremes x;
-    if (!is_film(film) || !(fabs(h) < INFINITY) || !(fabs(voltage) < INFINITY)) return LEFT_TO_OTHERS;
-    pose(film, h, voltage, &problem);
-    if (!(problem.span > 0.0 && problem.span <= LONGEST) || !is_positive(problem.height)) return LEFT_TO_OTHERS;
+    if (!pose(film, h, voltage, &posed)) return LEFT_TO_OTHERS;
+    Problem problem = problem_of(&posed);
     /* The plain equations may still have a state with compression around and tension along the film. */
     int slack = is_slack(&problem);
     out->iterations = 0;
     if (slack && task->relaxed) return SLACK;
-    int64_t first = task->first_modes[problem.span <= 2.4 ? 0 : problem.span <= 3.1 ? 1 : 2];
-    int status = refine(&problem, task->tables, first, task->tolerance, task->relaxed != 0, &grid, &state, &found,
-                        &out->error_estimate);
-    if (status == FOLDED) return wrinkled_answer(task, film, &problem, h, voltage, &found, &grid, &state, out, kept);
-    if (status == UNSETTLED) return followed_answer(task, film, &problem, h, voltage, slack, found.steps, out, kept);
-    if (status != TAUT) return status;
-    evaluate(&problem, &grid, &state, NULL, &at);
-    Solved solved = {1, &grid, &at, NULL};
-    extremes(&problem, &solved, found.lam, &x);
-    if (task->relaxed && !(x.hoop >= ROUND_OFF_TENSION * x.meridional))
-        return wrinkled_answer(task, film, &problem, h, voltage, &found, &grid, &state, out, kept);
-    int doubtful = !(x.meridional > 0.0) || !(x.softening <= SOFTENING);
-    if (doubtful && x.meridional > 0.0)
-        doubtful = !connected(&problem, task->tables[CHECK_MODES], &grid, &state, found.lam);
-    if (doubtful) return followed_answer(task, film, &problem, h, voltage, slack, found.steps, out, kept);
-    return plain_answer(task, film, &problem, h, voltage, &x, &found, &grid, &state, &at, out, kept);
+    int status = refine(&problem, task->tables, modes_to_begin_with(task, posed.span), task->tolerance,
+                        task->relaxed != 0, &grid, &state, &found, &out->error_estimate);
+    return continued(task, film, &problem, h, voltage, slack, status, &found, &grid, &state, out, kept);
+}
+
+/* The same of a state that `solve_several` has brought so far. */
+static int64_t completed(const Task *task, const Film *film, double h, double voltage, const One *one, Answer *out) {
+    Grid grid;
+    State state;
+    Extremes x;
+    Derivatives d;
+    Iterate found = {one->lam, NAN, NAN, NAN, one->steps, one->status == TAUT};
+    Problem problem = problem_of(&one->posed);
+    problem.mechanical = one->mechanical;
+    problem.electric = one->electric;
+    out->iterations = one->steps;
+    out->error_estimate = one->error;
+    if (one->status == SLACK || one->status == NEEDS_TABLE) return one->status;
+    if (one->status == TAUT) {
+        memcpy(&x, one->extremes, sizeof x);
+        if (!is_doubtful(&x) && !(task->relaxed && is_folded(&x))) {
+            int wrinkled = x.hoop < ROUND_OFF_TENSION * x.meridional;
+            int64_t placed = place_all(film, &problem, h, voltage, &x, &found, one->modes, wrinkled, out);
+            memcpy(&d, one->derivatives, sizeof d);
+            if (task->sensitivities) place_slopes(film, h, voltage, &d, out);
+            return placed;
+        }
+    }
+    lay(&grid, task->tables[one->modes], one->modes, -problem.span, 0.0);
+    memcpy(state.c, one->c, sizeof state.c);
+    memcpy(state.w, one->w, sizeof state.w);
+    return continued(task, film, &problem, h, voltage, (int)one->slack, one->status, &found, &grid, &state, out, NULL);
 }
 
 /* A state without numbers. */
@@ -264,28 +293,51 @@ static int is_task(const Task *task) {
     return task->tolerance >= 1e-12 && task->tolerance <= 1e-2;
 }
 
+/* States side by side, `which` of a call's films they are of, and where their answers go. */
+static void solve_block(const Task *task, const Film *films, int64_t film_count, const int64_t *which, int64_t states,
+                        const double *h, const double *voltage, Answer *answers) {
+    One ones[BLOCK];
+    int64_t place[BLOCK], count = 0;
+    for (int64_t s = 0; s < states; s++) {
+        int good = which[s] >= 0 && which[s] < film_count;
+        if (good && pose(&films[which[s]], h[s], voltage[s], &ones[count].posed)) place[count++] = s;
+    }
+    if (four_at_once && (task->lanes == 0 || task->lanes > 2))
+        solve_several_wide(task, ones, count);
+    else
+        solve_several_narrow(task, ones, count);
+    for (int64_t k = 0; k < count; k++) {
+        int64_t s = place[k];
+        answers[s].status = completed(task, &films[which[s]], h[s], voltage[s], &ones[k], &answers[s]);
+    }
+}
+
 /* Solve the states (films[which[s]], h[s], voltage[s]), in SI units; `kept` takes their unknowns, or is NULL. Returns
    how many states have no answer here, or -1 where the task itself makes no sense. */
 EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t film_count, const int64_t *which,
                                 int64_t states, const double *h, const double *voltage, Answer *answers, Kept *kept) {
-    int64_t left = 0;
+    int64_t left = 0, alone = kept || states < 2 || task->lanes == 1;
     if (!is_task(task)) return -1;
-    for (int64_t s = 0; s < states; s++) {
-        Answer *out = &answers[s];
-        out->status = LEFT_TO_OTHERS;
+    for (int64_t s = 0; s < states; s++) answers[s].status = LEFT_TO_OTHERS;
+    for (int64_t s = 0; s < states && alone; s++)
         if (which[s] >= 0 && which[s] < film_count)
-            out->status = answer(task, &films[which[s]], h[s], voltage[s], out, kept ? &kept[s] : NULL);
-        if (out->status > WRINKLED) leave_blank(out);
-        if (out->status < 0) left++;
+            answers[s].status =
+                answer(task, &films[which[s]], h[s], voltage[s], &answers[s], kept ? &kept[s] : NULL);
+    for (int64_t s = 0; s < states && !alone; s += BLOCK)
+        solve_block(task, films, film_count, which + s, states - s < BLOCK ? states - s : BLOCK, h + s, voltage + s,
+                    answers + s);
+    for (int64_t s = 0; s < states; s++) {
+        if (answers[s].status > WRINKLED) leave_blank(&answers[s]);
+        if (answers[s].status < 0) left++;
     }
     return left;
 }
 
 /* Whether no tension can hold the film: 1 or 0, or -1 where that is left to others. */
 EXPORT int64_t dea_kernel_hangs_slack(const Film *film, double h, double voltage) {
-    Problem problem;
-    if (!is_film(film) || !(fabs(h) < INFINITY) || !(fabs(voltage) < INFINITY)) return -1;
-    pose(film, h, voltage, &problem);
+    Posed posed;
+    if (!pose(film, h, voltage, &posed)) return -1;
+    Problem problem = problem_of(&posed);
     return is_slack(&problem);
 }
 

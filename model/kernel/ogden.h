@@ -2,19 +2,19 @@
 
        W = sum mu_n/al_n (l1^al_n + l2^al_n + l3^al_n - 3),    dW/dL_i = sum mu_n (l_i^al_n - l_3^al_n). */
 
-static void ogden_derivatives(const Law *law, int64_t n, const double *log, Stress *out) {
-    double m[3 * MOST_STATIONS]; /* sum mu (l^al - 1) */
-    double a[3 * MOST_STATIONS]; /* sum mu al l^al */
-    double twice_shear = 0.0;
+static void ogden_derivatives(const Law *law, int64_t n, const Real *log, Stress *out) {
+    Real m[3 * MOST_STATIONS]; /* sum mu (l^al - 1) */
+    Real a[3 * MOST_STATIONS]; /* sum mu al l^al */
+    Real twice_shear = of(0.0);
     for (int64_t k = 0; k < law->moduli; k++) twice_shear += law->mu[k] * law->alpha[k];
     for (int64_t i = 0; i < 3 * n; i++) {
-        m[i] = 0.0;
+        m[i] = of(0.0);
         a[i] = twice_shear;
     }
     for (int64_t k = 0; k < law->moduli; k++) {
-        double mu = law->mu[k], alpha = law->alpha[k];
+        Real mu = law->mu[k], alpha = law->alpha[k];
         for (int64_t i = 0; i < 3 * n; i++) {
-            double term = mu * expm1_of(alpha * log[i]);
+            Real term = mu * expm1_of(alpha * log[i]);
             m[i] += term;
             a[i] += alpha * term;
         }
@@ -28,16 +28,16 @@ static void ogden_derivatives(const Law *law, int64_t n, const double *log, Stre
     }
 }
 
-static void ogden_projected(const Law *law, int64_t n, const double *log, const double *rate1, const double *rate2,
-                            double *by_mu, double *by_alpha) {
-    double rates[3 * MOST_STATIONS], powers[3 * MOST_STATIONS];
+static void ogden_projected(const Law *law, int64_t n, const Real *log, const Real *rate1, const Real *rate2,
+                            Real *by_mu, Real *by_alpha) {
+    Real rates[3 * MOST_STATIONS], powers[3 * MOST_STATIONS];
     for (int64_t i = 0; i < n; i++) {
         rates[i] = rate1[i];
         rates[n + i] = rate2[i];
         rates[2 * n + i] = -(rate1[i] + rate2[i]);
     }
     for (int64_t k = 0; k < law->moduli; k++) {
-        double alpha = law->alpha[k], of_mu = 0.0, of_alpha = 0.0;
+        Real alpha = law->alpha[k], of_mu = of(0.0), of_alpha = of(0.0);
         for (int64_t i = 0; i < 3 * n; i++) powers[i] = expm1_of(alpha * log[i]);
         for (int64_t i = 0; i < 3 * n; i++) {
             of_mu += powers[i] * rates[i];

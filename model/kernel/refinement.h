@@ -26,65 +26,66 @@ enum {
     LEFT_TO_OTHERS = -1,
     NEEDS_TABLE = -2,
     FOLDED = -3,
-    UNSETTLED = -4
+    UNSETTLED = -4,
+    OPEN = -5
 };
 
 /* A state after Newton at one resolution. */
 typedef struct {
-    double lam;
-    double change; /* largest relative change of a slope in the last step */
-    double tail;   /* share of the energy that the last modes carry */
-    double hoop;   /* least hoop over largest meridional stress at the points, before the last step */
-    int64_t steps;
-    int ok;
+    Real lam;
+    Real change; /* largest relative change of a slope in the last step */
+    Real tail;   /* share of the energy that the last modes carry */
+    Real hoop;   /* least hoop over largest meridional stress at the points, before the last step */
+    Whole steps;
+    Mask ok;
 } Iterate;
 
-static double larger(double x, double y) { return x > y ? x : y; }
-static double smaller(double x, double y) { return x < y ? x : y; }
-static double clipped(double x, double most) { return smaller(larger(x, -most), most); }
-
 /* Change of a slope at which Newton's error is just below the tolerance. */
-static double goal(double tolerance) { return smaller(0.03, larger(1e-6, sqrt(0.9 * tolerance / NEWTON_FACTOR))); }
+static double goal(double tolerance) { return fmin(0.03, fmax(1e-6, sqrt(0.9 * tolerance / NEWTON_FACTOR))); }
 
 /* Estimated relative error of `now`, after the force `previous` at the resolution before. */
-static double estimate(const Iterate *now, double previous, double tolerance, double factor) {
-    double refined = factor * fabs((now->lam - previous) / now->lam);
+static Real estimate(const Iterate *now, Real previous, double tolerance, double factor) {
+    Real refined = factor * abs_of((now->lam - previous) / now->lam);
     return refined + NEWTON_FACTOR * (now->change * now->change) + now->tail + (ROUND_OFF + LEAST_SHARE * tolerance);
 }
 
-/* Add a step to the state, shortened where a slope would change beyond reason. Returns the largest relative change,
-   which counts for more where the tension is a small rest of elastic and Maxwell stress; NaN where there is none. */
-static double advance(const Grid *grid, const Points *at, const Step *step, int charged, State *state) {
+/* Add a step to the state in the lanes that are `open`, shortened where a slope would change beyond reason. Returns the
+   largest relative change, which counts for more where the tension is a small rest of elastic and Maxwell stress; NaN
+   where there is none. */
+static Real advance(const Problem *problem, const Grid *grid, const Points *at, const Step *step, Mask open,
+                    State *state) {
     int64_t points = grid->table->points, modes = grid->table->modes;
-    double change = 0.0, share = 1.0, sum = step->lam;
+    Real change = of(0.0), share = of(1.0), sum = step->lam;
+    Mask charged = problem->field != 0.0;
     for (int64_t i = 0; i < points; i++) {
-        change = larger(change, fabs(step->dw[i] / state->w[i]));
+        change = larger(change, abs_of(step->dw[i] / state->w[i]));
         sum += step->dw[i];
     }
-    if (!(fabs(sum) < INFINITY)) return NAN;
-    if (charged) {
-        for (int64_t i = 0; i < points; i++) share = larger(share, fabs(at->law.maxwell[i] / at->law.t1[i]));
-        change *= sqrt(share);
+    if (any(charged)) {
+        for (int64_t i = 0; i < points; i++) share = larger(share, abs_of(at->law.maxwell[i] / at->law.t1[i]));
+        change = pick(charged, change * sqrt_of(share), change);
     }
-    double part = change > 2.0 ? 2.0 / change : 1.0;
+    Real part = pick(change > 2.0, 2.0 / change, of(1.0));
+    open &= finite(sum);
     for (int64_t i = 0; i < points; i++) {
-        double w = state->w[i], moved = w + part * step->dw[i];
-        state->w[i] = change > 0.8 && !(moved > 0.2 * w) ? 0.2 * w : moved;
+        Real w = state->w[i], moved = w + part * step->dw[i];
+        moved = pick((change > 0.8) & is_not(moved > 0.2 * w), 0.2 * w, moved);
+        state->w[i] = pick(open, moved, w);
     }
-    for (int64_t k = 0; k < modes; k++) state->c[k] += part * step->dc[k];
-    return change;
+    for (int64_t k = 0; k < modes; k++) state->c[k] = pick(open, state->c[k] + part * step->dc[k], state->c[k]);
+    return pick(finite(sum), change, of(NAN));
 }
 
 /* Energy of the last mode and a tenth of that of the last but one, over F h. */
-static double tail(const Problem *problem, const Grid *grid, const State *state, const Reduced *system, double lam) {
+static Real tail(const Problem *problem, const Grid *grid, const State *state, const Reduced *system, Real lam) {
     int64_t k = grid->table->modes - 1;
-    double last = state->c[k] * state->c[k] * system->diagonal[k];
-    double fore = state->c[k - 1] * state->c[k - 1] * system->diagonal[k - 1];
+    Real last = state->c[k] * state->c[k] * system->diagonal[k];
+    Real fore = state->c[k - 1] * state->c[k - 1] * system->diagonal[k - 1];
     return 0.5 * (last + 0.1 * fore) / (lam * problem->height);
 }
 
-static double hoop_share(int64_t n, const Stress *law) {
-    double least = INFINITY, most = -INFINITY;
+static Real hoop_share(int64_t n, const Stress *law) {
+    Real least = of(INFINITY), most = of(-INFINITY);
     for (int64_t i = 0; i < n; i++) {
         least = smaller(least, law->t2[i]);
         most = larger(most, law->t1[i]);
@@ -97,40 +98,45 @@ static Iterate newton(Problem *problem, const Grid *grid, State *state, double a
     Points at;
     Reduced system;
     Step step;
-    Iterate found = {NAN, NAN, NAN, NAN, 0, 0};
-    while (found.steps < limit) {
+    Mask open = problem->counts, every = open;
+    Iterate found = {of(NAN), of(NAN), of(NAN), of(NAN), counted(open, 0), is_not(yes())};
+    for (int64_t k = 0; k < limit && any(open); k++) {
+        problem->counts = open;
         evaluate(problem, grid, state, NULL, &at);
         newton_step(problem, grid, state->w, &at, &system, &step);
-        found.steps++;
-        found.change = advance(grid, &at, &step, problem->field != 0.0, state);
-        if (found.change <= aim) {
-            found.lam = step.lam;
-            found.tail = tail(problem, grid, state, &system, step.lam);
-            found.hoop = hoop_share(grid->table->points, &at.law);
-            found.ok = step.stable && step.lam > 0.0;
-            break;
+        found.steps += counted(open, 1);
+        found.change = pick(open, advance(problem, grid, &at, &step, open, state), found.change);
+        Mask done = open & (found.change <= aim);
+        if (any(done)) {
+            found.lam = pick(done, step.lam, found.lam);
+            found.tail = pick(done, tail(problem, grid, state, &system, step.lam), found.tail);
+            found.hoop = pick(done, hoop_share(grid->table->points, &at.law), found.hoop);
+            found.ok |= done & step.stable & (step.lam > 0.0);
         }
-        if (!(found.change < INFINITY)) break;
+        open &= is_not(done) & finite(found.change);
     }
+    problem->counts = every;
     return found;
 }
 
 /* Values at the points carried to others by `matrix`, (to, from). */
-static void carried(int64_t to, int64_t from, const double *matrix, double *values) {
-    double old[MOST_POINTS];
-    memcpy(old, values, sizeof(double) * (size_t)from);
-    for (int64_t i = 0; i < to; i++) values[i] = dot(from, matrix + i * from, old);
+static void carried(int64_t to, int64_t from, const double *matrix, Real *values) {
+    Real old[MOST_POINTS];
+    memcpy(old, values, sizeof(Real) * (size_t)from);
+    for (int64_t i = 0; i < to; i++) values[i] = across(from, matrix + i * from, old);
 }
 
 /* The state with other modes: `matrix` carries the slopes, which stay above zero. */
 static void prolong(const Table *from, const Table *to, const double *matrix, State *state) {
-    double least = state->w[0];
+    Real least = state->w[0];
     for (int64_t i = 1; i < from->points; i++) least = smaller(least, state->w[i]);
-    for (int64_t k = from->modes; k < to->modes; k++) state->c[k] = 0.0;
+    for (int64_t k = from->modes; k < to->modes; k++) state->c[k] = of(0.0);
     carried(to->points, from->points, matrix, state->w);
     for (int64_t i = 0; i < to->points; i++)
-        if (!(state->w[i] > 0.0)) state->w[i] = least;
+        state->w[i] = pick(state->w[i] > 0.0, state->w[i], least);
 }
+
+#if LANES == 1 /* the way over the resolutions; several.c has its own for many states */
 
 /* The state of `grid` to `tolerance`, at the resolution that it needs. `tables` has one for so many modes at that
    place, or none. `relaxed`: a state whose hoop stress is clearly negative is FOLDED at once. */
@@ -163,5 +169,7 @@ static int refine(Problem *problem, const Table *const *tables, int64_t modes, d
     guess(problem, grid, state);
     return settle_plain(problem, tables, tolerance, relaxed, grid, state, found, error);
 }
+
+#endif
 
 #endif

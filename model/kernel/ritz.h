@@ -38,70 +38,77 @@ typedef struct {
     const double *check;      /* (CHECK_POINTS, Q): to the points of CHECK_MODES */
 } Table;
 
-/* One state to solve, dimensionless, and how many points of its law were computed. */
+/* A state to solve, dimensionless. */
 typedef struct {
-    Law law;
+    FilmLaw law;
     double field; /* eps (V/T)^2 / G; 0 without voltage */
     double log_prestretch, span, height;
-    int64_t mechanical, electric, relaxed;
+} Posed;
+
+/* The same of every lane, and how many points of its law were computed, in the lanes where these count. */
+typedef struct {
+    Law law;
+    Real field, log_prestretch, span, height;
+    Mask counts;
+    Whole mechanical, electric, relaxed;
 } Problem;
 
 /* A table laid on an element between two values of x; with its hats where it has neighbours. */
 typedef struct {
     const Table *table;
     int64_t functions;
-    double left, right;
-    double radius[MOST_POINTS]; /* R/b */
-    double once[MOST_POINTS];   /* weight dx R */
-    double twice[MOST_POINTS];  /* weight dx R^2 */
-    double dxi;                 /* d(xi)/dx */
+    Real left, right;
+    Real radius[MOST_POINTS]; /* R/b */
+    Real once[MOST_POINTS];   /* weight dx R */
+    Real twice[MOST_POINTS];  /* weight dx R^2 */
+    Real dxi;                 /* d(xi)/dx */
 } Grid;
 
 typedef struct {
-    double c[MOST_FUNCTIONS];
-    double w[MOST_POINTS];
+    Real c[MOST_FUNCTIONS];
+    Real w[MOST_POINTS];
 } State;
 
 /* The state at the points. */
 typedef struct {
-    double e[MOST_POINTS], q[MOST_POINTS];
-    double log[3 * MOST_POINTS]; /* L1, L2, L3 */
+    Real e[MOST_POINTS], q[MOST_POINTS];
+    Real log[3 * MOST_POINTS]; /* L1, L2, L3 */
     Stress law;
-    double along[MOST_POINTS];  /* dL1/dp */
-    double down[MOST_POINTS];   /* dL1/dw */
-    double around[MOST_POINTS]; /* dL2/de */
-    double metric[MOST_POINTS]; /* p^2 + w^2 */
-    double hoop[MOST_POINTS];   /* ln(lp r/R), the same as L2 but where relaxed */
-    double rate[MOST_POINTS];   /* dL2/dL1 where relaxed */
+    Real along[MOST_POINTS];  /* dL1/dp */
+    Real down[MOST_POINTS];   /* dL1/dw */
+    Real around[MOST_POINTS]; /* dL2/de */
+    Real metric[MOST_POINTS]; /* p^2 + w^2 */
+    Real hoop[MOST_POINTS];   /* ln(lp r/R), the same as L2 but where relaxed */
+    Real rate[MOST_POINTS];   /* dL2/dL1 where relaxed */
 } Points;
 
 /* The Newton system after the slopes are eliminated: height = reach + give lam - coupling . dc. */
 typedef struct {
-    double matrix[MOST_PAIRS]; /* lower triangle, row by row; after `factor` L below the diagonal and D on it */
-    double diagonal[MOST_FUNCTIONS];
-    double residual[MOST_FUNCTIONS], coupling[MOST_FUNCTIONS];
-    double give, reach;
-    double hw[MOST_POINTS], kqw[MOST_POINTS], kew[MOST_POINTS], gw[MOST_POINTS];
-    int positive;
+    Real matrix[MOST_PAIRS]; /* lower triangle, row by row; after `factor` L below the diagonal and D on it */
+    Real diagonal[MOST_FUNCTIONS];
+    Real residual[MOST_FUNCTIONS], coupling[MOST_FUNCTIONS];
+    Real give, reach;
+    Real hw[MOST_POINTS], kqw[MOST_POINTS], kew[MOST_POINTS], gw[MOST_POINTS];
+    Mask positive;
 } Reduced;
 
 /* One Newton step: the change of the state and the force after it. */
 typedef struct {
-    double dc[MOST_FUNCTIONS], dw[MOST_POINTS];
-    double lam;
-    int stable;
+    Real dc[MOST_FUNCTIONS], dw[MOST_POINTS];
+    Real lam;
+    Mask stable;
 } Step;
 
-static void lay(Grid *grid, const Table *table, int64_t functions, double left, double right) {
-    double half = 0.5 * (right - left);
+static void lay(Grid *grid, const Table *table, int64_t functions, Real left, Real right) {
+    Real half = 0.5 * (right - left);
     grid->table = table;
     grid->functions = functions;
     grid->left = left;
     grid->right = right;
     grid->dxi = 1.0 / half;
     for (int64_t i = 0; i < table->points; i++) {
-        double radius = exp_of(half * (table->xi[i] - 1.0) + right);
-        double once = table->weight[i] * half * radius;
+        Real radius = exp_of(half * (table->xi[i] - 1.0) + right);
+        Real once = table->weight[i] * half * radius;
         grid->radius[i] = radius;
         grid->once[i] = once;
         grid->twice[i] = once * radius;
@@ -109,9 +116,9 @@ static void lay(Grid *grid, const Table *table, int64_t functions, double left, 
 }
 
 /* e and q at the points, or their changes, from the modes' coefficients. */
-static void strain(const Grid *grid, const double *c, double *e, double *q) {
+static void strain(const Grid *grid, const Real *c, Real *e, Real *q) {
     int64_t points = grid->table->points, every = grid->table->modes + 2;
-    for (int64_t i = 0; i < points; i++) e[i] = q[i] = 0.0;
+    for (int64_t i = 0; i < points; i++) e[i] = q[i] = of(0.0);
     for (int64_t k = 0; k < grid->functions; k++) {
         const double *value = grid->table->values + k * points, *slope = value + every * points;
         for (int64_t i = 0; i < points; i++) {
@@ -123,14 +130,15 @@ static void strain(const Grid *grid, const double *c, double *e, double *q) {
 }
 
 /* True stress dW-star/dL_i and its tangent: the law's, less the Maxwell stress k exp(2 (L1 + L2)). */
-static void stress(Problem *problem, int64_t n, const double *log, Stress *out) {
+static void stress(Problem *problem, int64_t n, const Real *log, Stress *out) {
     derivatives_of_law(&problem->law, n, log, out);
-    problem->mechanical += n;
-    for (int64_t i = 0; i < n; i++) out->maxwell[i] = 0.0;
-    if (problem->field == 0.0) return;
-    problem->electric += n;
+    problem->mechanical += counted(problem->counts, n);
+    for (int64_t i = 0; i < n; i++) out->maxwell[i] = of(0.0);
+    Mask charged = problem->field != 0.0;
+    if (!any(charged)) return;
+    problem->electric += counted(problem->counts & charged, n);
     for (int64_t i = 0; i < n; i++) {
-        double b = problem->field * exp_of(-2.0 * log[2 * n + i]);
+        Real b = pick(charged, problem->field * exp_of(-2.0 * log[2 * n + i]), of(0.0));
         out->maxwell[i] = b;
         out->t1[i] -= b;
         out->t2[i] -= b;
@@ -142,25 +150,25 @@ static void stress(Problem *problem, int64_t n, const double *log, Stress *out) 
 
 /* The law with the hoop stretch eliminated, so that the hoop stress is zero: `relax` in model/material/law.py. Leaves
    dL2 = change + rate dL1; returns whether a natural hoop stretch exists everywhere. */
-static int relax(int64_t n, Stress *law, double *change, double *rate) {
-    int regular = 1;
+static Mask relax(int64_t n, Stress *law, Real *change, Real *rate) {
+    Mask regular = yes();
     for (int64_t i = 0; i < n; i++) {
-        if (!(law->h22[i] > 0.0)) regular = 0;
+        regular &= law->h22[i] > 0.0;
         rate[i] = -law->h12[i] / law->h22[i];
         change[i] = -law->t2[i] / law->h22[i];
         law->t1[i] += law->h12[i] * change[i];
         law->h11[i] += law->h12[i] * rate[i];
-        law->t2[i] = law->h12[i] = law->h22[i] = 0.0;
+        law->t2[i] = law->h12[i] = law->h22[i] = of(0.0);
     }
     return regular;
 }
 
 /* Strains, stresses and tangents of a state; of a relaxed element with its `natural` ln(l2), else NULL. */
-static void evaluate(Problem *problem, const Grid *grid, const State *state, const double *natural, Points *at) {
+static void evaluate(Problem *problem, const Grid *grid, const State *state, const Real *natural, Points *at) {
     int64_t n = grid->table->points;
     strain(grid, state->c, at->e, at->q);
     for (int64_t i = 0; i < n; i++) {
-        double e = at->e[i], q = at->q[i], w = state->w[i], g = (q + 2.0) * q + w * w;
+        Real e = at->e[i], q = at->q[i], w = state->w[i], g = (q + 2.0) * q + w * w;
         at->metric[i] = g + 1.0;
         at->along[i] = (q + 1.0) / (g + 1.0);
         at->down[i] = w / (g + 1.0);
@@ -170,64 +178,64 @@ static void evaluate(Problem *problem, const Grid *grid, const State *state, con
     }
     for (int64_t i = 0; i < 2 * n; i++) at->log[i] = log1p_of(at->log[i]);
     for (int64_t i = 0; i < n; i++) {
-        double log1 = 0.5 * at->log[i] + problem->log_prestretch;
+        Real log1 = 0.5 * at->log[i] + problem->log_prestretch;
         at->hoop[i] = at->log[n + i] + problem->log_prestretch;
-        double log2 = natural ? natural[i] : at->hoop[i];
+        Real log2 = natural ? natural[i] : at->hoop[i];
         at->log[i] = log1;
         at->log[n + i] = log2;
         at->log[2 * n + i] = -(log1 + log2);
     }
     stress(problem, n, at->log, &at->law);
-    double change[MOST_POINTS];
+    Real change[MOST_POINTS];
     if (!natural) return;
     relax(n, &at->law, change, at->rate);
-    problem->relaxed += n;
+    problem->relaxed += counted(problem->counts, n);
 }
 
 /* `sum over points of ee e e' + eq (e q' + q e') + qq q q'` for every pair of modes, and of `on_e e + on_q q`. The
    three sums come in terms of a mode's value and of its derivative in xi. */
 typedef struct {
-    double pair[3][MOST_POINTS], coupling[2][MOST_POINTS], residual[2][MOST_POINTS];
+    Real pair[3][MOST_POINTS], coupling[2][MOST_POINTS], residual[2][MOST_POINTS];
 } Weights;
 
 static void assemble(const Table *table, int64_t functions, const Weights *on, Reduced *system) {
     int64_t every = table->modes + 2, stride = every * (every + 1) / 2, pairs = functions * (functions + 1) / 2;
-    for (int64_t k = 0; k < functions; k++) system->coupling[k] = system->residual[k] = 0.0;
-    for (int64_t p = 0; p < pairs; p++) system->matrix[p] = 0.0;
+    for (int64_t k = 0; k < functions; k++) system->coupling[k] = system->residual[k] = of(0.0);
+    for (int64_t p = 0; p < pairs; p++) system->matrix[p] = of(0.0);
     for (int64_t i = 0; i < table->points; i++) {
         const double *value = table->project + 2 * i * every, *slope = value + every;
-        double c0 = on->coupling[0][i], c1 = on->coupling[1][i], r0 = on->residual[0][i], r1 = on->residual[1][i];
+        Real c0 = on->coupling[0][i], c1 = on->coupling[1][i], r0 = on->residual[0][i], r1 = on->residual[1][i];
         for (int64_t k = 0; k < functions; k++) {
             system->coupling[k] += c0 * value[k] + c1 * slope[k];
             system->residual[k] += r0 * value[k] + r1 * slope[k];
         }
         const double *both = table->pairs + 3 * i * stride, *mixed = both + stride, *slopes = mixed + stride;
-        double m0 = on->pair[0][i], m1 = on->pair[1][i], m2 = on->pair[2][i];
+        Real m0 = on->pair[0][i], m1 = on->pair[1][i], m2 = on->pair[2][i];
         for (int64_t p = 0; p < pairs; p++) system->matrix[p] += m0 * both[p] + m1 * mixed[p] + m2 * slopes[p];
     }
 }
 
 /* Assemble the Newton system of the modes alone: a slope stands alone at its point and is eliminated there. */
-static void reduce(const Grid *grid, const double *w, const Points *at, Reduced *system) {
+static void reduce(const Grid *grid, const Real *w, const Points *at, Reduced *system) {
     const Stress *law = &at->law;
     Weights on;
-    double give[MOST_POINTS], reach[MOST_POINTS], kww[MOST_POINTS];
+    Real give[MOST_POINTS], reach[MOST_POINTS], kww[MOST_POINTS];
     int64_t n = grid->table->points;
     for (int64_t i = 0; i < n; i++) {
-        double along = at->along[i], down = at->down[i], around = at->around[i];
-        double t1 = law->t1[i], t2 = law->t2[i];
-        double once = grid->once[i], twice = grid->twice[i];
-        double tm = t1 / at->metric[i], d = law->h11[i] - 2.0 * t1, slope = d * down;
+        Real along = at->along[i], down = at->down[i], around = at->around[i];
+        Real t1 = law->t1[i], t2 = law->t2[i];
+        Real once = grid->once[i], twice = grid->twice[i];
+        Real tm = t1 / at->metric[i], d = law->h11[i] - 2.0 * t1, slope = d * down;
         kww[i] = slope * down + tm;
-        double hw = 1.0 / kww[i], kqw = slope * along, h12a = law->h12[i] * around, kew = h12a * down, gw = t1 * down;
-        double thw = tm * hw, hkew = hw * kew, hg = hw * gw;
-        double qq = twice * ((d / at->metric[i] + tm) * thw); /* K_qq - K_qw^2 / K_ww without the cancellation */
-        double eq = twice * (h12a * along * thw);
-        double ee = twice * ((law->h22[i] - t2) * (around * around) - kew * hkew);
+        Real hw = 1.0 / kww[i], kqw = slope * along, h12a = law->h12[i] * around, kew = h12a * down, gw = t1 * down;
+        Real thw = tm * hw, hkew = hw * kew, hg = hw * gw;
+        Real qq = twice * ((d / at->metric[i] + tm) * thw); /* K_qq - K_qw^2 / K_ww without the cancellation */
+        Real eq = twice * (h12a * along * thw);
+        Real ee = twice * ((law->h22[i] - t2) * (around * around) - kew * hkew);
         on.pair[0][i] = (ee + eq) + (qq + eq);
         on.pair[1][i] = (qq + eq) * grid->dxi;
         on.pair[2][i] = qq * (grid->dxi * grid->dxi);
-        double on_q = once * (hw * kqw);
+        Real on_q = once * (hw * kqw);
         on.coupling[0][i] = once * hkew + on_q;
         on.coupling[1][i] = on_q * grid->dxi;
         on_q = twice * (t1 * along - hg * kqw);
@@ -241,41 +249,41 @@ static void reduce(const Grid *grid, const double *w, const Points *at, Reduced 
         system->gw[i] = gw;
     }
     assemble(grid->table, grid->functions, &on, system);
-    system->give = system->reach = 0.0;
-    system->positive = 1;
+    system->give = system->reach = of(0.0);
+    system->positive = yes();
     for (int64_t i = 0; i < n; i++) {
         system->give += give[i];
         system->reach += reach[i];
-        if (!(kww[i] > 0.0)) system->positive = 0;
+        system->positive &= kww[i] > 0.0;
     }
 }
 
 /* Eliminate the multiplier, which makes the matrix positive definite exactly where the state is stable, and take it
    apart into L D L'. Returns whether it is positive definite; another matrix gets what it gets. */
-static int factor(int64_t n, const double *coupling, double give, double *matrix, double *diagonal) {
-    int positive = 1;
-    double *row = matrix;
+static Mask factor(int64_t n, const Real *coupling, Real give, Real *matrix, Real *diagonal) {
+    Mask positive = yes();
+    Real *row = matrix;
     for (int64_t i = 0; i < n; i++, row += i) {
-        double share = coupling[i] / give;
+        Real share = coupling[i] / give;
         for (int64_t j = 0; j <= i; j++) row[j] += share * coupling[j];
         diagonal[i] = row[i];
-        const double *other = matrix;
+        const Real *other = matrix;
         for (int64_t j = 0; j < i; j++, other += j)
             for (int64_t k = 0; k < j; k++) row[j] -= row[k] * other[k];
         other = matrix;
         for (int64_t j = 0; j < i; j++, other += j) {
-            double part = row[j] / other[j];
+            Real part = row[j] / other[j];
             row[i] -= part * row[j];
             row[j] = part;
         }
-        if (!(row[i] > 0.0)) positive = 0;
+        positive &= row[i] > 0.0;
     }
     return positive;
 }
 
 /* Solve the factored system in place. */
-static void substitute(int64_t n, const double *matrix, double *x) {
-    const double *row = matrix;
+static void substitute(int64_t n, const Real *matrix, Real *x) {
+    const Real *row = matrix;
     for (int64_t i = 0; i < n; i++, row += i)
         for (int64_t j = 0; j < i; j++) x[i] -= row[j] * x[j];
     row = matrix;
@@ -287,32 +295,39 @@ static void substitute(int64_t n, const double *matrix, double *x) {
 }
 
 /* How the slopes follow a change `dc` of the modes with the force `lam`. */
-static void slopes(const Grid *grid, const Reduced *system, const double *dc, double lam, int gradient, double *dw) {
-    double de[MOST_POINTS], dq[MOST_POINTS];
+static void slopes(const Grid *grid, const Reduced *system, const Real *dc, Real lam, int gradient, Real *dw) {
+    Real de[MOST_POINTS], dq[MOST_POINTS];
     strain(grid, dc, de, dq);
     for (int64_t i = 0; i < grid->table->points; i++) {
-        double rest = lam / grid->radius[i] - (gradient ? system->gw[i] : 0.0);
+        Real rest = lam / grid->radius[i] - (gradient ? system->gw[i] : of(0.0));
         dw[i] = (rest - dq[i] * system->kqw[i] - de[i] * system->kew[i]) * system->hw[i];
     }
 }
 
-static double dot(int64_t n, const double *x, const double *y) {
-    double total = 0.0;
+static Real dot(int64_t n, const Real *x, const Real *y) {
+    Real total = of(0.0);
     for (int64_t i = 0; i < n; i++) total += x[i] * y[i];
     return total;
 }
 
+/* The same with a row of a table. */
+static Real across(int64_t n, const double *row, const Real *values) {
+    Real total = of(0.0);
+    for (int64_t i = 0; i < n; i++) total += row[i] * values[i];
+    return total;
+}
+
 /* The Newton step at a state; `system` is left factored. */
-static void newton_step(const Problem *problem, const Grid *grid, const double *w, const Points *at, Reduced *system,
+static void newton_step(const Problem *problem, const Grid *grid, const Real *w, const Points *at, Reduced *system,
                         Step *step) {
     int64_t modes = grid->table->modes;
     reduce(grid, w, at, system);
-    double lam0 = (problem->height - system->reach) / system->give;
-    int positive = factor(modes, system->coupling, system->give, system->matrix, system->diagonal);
+    Real lam0 = (problem->height - system->reach) / system->give;
+    Mask positive = factor(modes, system->coupling, system->give, system->matrix, system->diagonal);
     for (int64_t k = 0; k < modes; k++) step->dc[k] = -(system->residual[k] + lam0 * system->coupling[k]);
     substitute(modes, system->matrix, step->dc);
     step->lam = lam0 + dot(modes, system->coupling, step->dc) / system->give;
-    step->stable = positive && system->positive;
+    step->stable = positive & system->positive;
     slopes(grid, system, step->dc, step->lam, 1, step->dw);
 }
 
@@ -328,17 +343,17 @@ static void tangent(const Grid *grid, const Reduced *system, Step *by_height) {
 /* A first state: r = R, and slopes that follow the power law w ~ R^(-1/n) of the film at its mean slope. */
 static void guess(Problem *problem, const Grid *grid, State *state) {
     int64_t n = grid->table->points;
-    double mean = problem->height / -expm1_of(-problem->span), square = mean * mean;
-    double log1 = 0.5 * log1p_of(square) + problem->log_prestretch, log2 = problem->log_prestretch;
-    double log[3] = {log1, log2, -(log1 + log2)};
+    Real mean = problem->height / -expm1_of(-problem->span), square = mean * mean;
+    Real log1 = 0.5 * log1p_of(square) + problem->log_prestretch, log2 = problem->log_prestretch;
+    Real log[3] = {log1, log2, -(log1 + log2)};
     Stress law;
     stress(problem, 1, log, &law);
-    double part = square / (1.0 + square);
-    double power = law.t1[0] > 0.0 ? 1.0 - 2.0 * part + part * law.h11[0] / law.t1[0] : 1.0;
-    if (!(power > 0.5)) power = 1.0;
-    for (int64_t k = 0; k < grid->table->modes; k++) state->c[k] = 0.0;
+    Real part = square / (1.0 + square);
+    Real power = 1.0 - 2.0 * part + part * law.h11[0] / law.t1[0];
+    power = pick((law.t1[0] > 0.0) & (power > 0.5), power, of(1.0));
+    for (int64_t k = 0; k < grid->table->modes; k++) state->c[k] = of(0.0);
     for (int64_t i = 0; i < n; i++) state->w[i] = exp_of(0.5 * problem->span * (1.0 - grid->table->xi[i]) / power);
-    double scale = problem->height / dot(n, grid->once, state->w);
+    Real scale = problem->height / dot(n, grid->once, state->w);
     for (int64_t i = 0; i < n; i++) state->w[i] *= scale;
 }
 

@@ -21,13 +21,13 @@ from model.arrays import Array
 from model.kernel.library import load
 from model.material.gent import Gent
 from model.material.law import Evaluations, Law
-from model.material.materials import Material
+from model.material.materials import EPSILON_0, Material
 from model.material.mooney_rivlin import MooneyRivlin
 from model.material.neo_hooke import NeoHooke
 from model.material.ogden import Ogden
 from model.material.yeoh import Yeoh
 from model.membrane import output, ritz
-from model.membrane.flat import Flat
+from model.membrane.flat import REAL, SLOPES, WHOLE, Flat
 from model.membrane.from_rest import CHECK_MODES, TRACE_MODES
 from model.membrane.refinement import SPANS, first_modes, next_modes
 from model.specimen import Specimen
@@ -35,11 +35,7 @@ from model.specimen import Specimen
 MOST_MODES, MOST_ELEMENTS, MOST_PARAMETERS = 64, 5, 8
 MOST_POINTS = MOST_MODES + ritz.MORE_POINTS
 LAWS: tuple[type[Law], ...] = (Ogden, NeoHooke, MooneyRivlin, Yeoh, Gent)  # in the order of their numbers in law.h
-SLOPES = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
-NUMBERS = (
-    *("force", "peak_field", "peak_field_radius", "min_hoop_stress", "min_meridional_stress", "max_stretch"),
-    *("error_estimate", "iterations", "modes"),
-)
+NUMBERS = (*REAL, *WHOLE)
 NEEDS_TABLE = -2  # in place of a status, of which the negative ones are left to others
 FEW_LEVELS = 3  # resolutions whose tables are made at once; most states need two
 # Tables for so many modes: the first levels only, those that nearly all states can do with, all. The last are large.
@@ -77,6 +73,7 @@ class _Task(Structure):
         ("first_modes", c_int64 * len(SPANS)),
         ("relaxed", c_int64),
         ("sensitivities", c_int64),
+        ("lanes", c_int64),
         ("tolerance", c_double),
     ]
 
@@ -115,7 +112,7 @@ class _Answer(Structure):
     """`Answer` in membrane.c."""
 
     _fields_ = [
-        *((name, c_double) for name in NUMBERS[:7]),
+        *((name, c_double) for name in REAL),
         ("lam", c_double),
         *((name, c_int64) for name in ("status", "iterations", "modes", "mechanical", "electric", "relaxed")),
         ("dforce", _Slopes),
@@ -171,7 +168,7 @@ def _table(modes: int) -> tuple[_Table, list[Array]]:
 def _task(tolerance: float, relaxed: bool, sensitivities: bool, most: int) -> _Task:
     """What the states of a call share; tables of every resolution up to ``most`` modes, of the first ones when 0."""
     firsts = [first_modes(span, tolerance) for span in SPANS]
-    task = _Task((), tuple(firsts), relaxed, sensitivities, tolerance)
+    task = _Task((), tuple(firsts), relaxed, sensitivities, 0, tolerance)
     begins = {*firsts, *(max(3, modes) for modes in firsts), CHECK_MODES}
     for modes in begins | set(TRACE_MODES) if most else begins:
         level = 0
@@ -181,21 +178,32 @@ def _task(tolerance: float, relaxed: bool, sensitivities: bool, most: int) -> _T
     return task
 
 
+def _films(specimens: Sequence[Specimen]) -> NDArray[np.void]:
+    """Films as the kernel reads them; one that it does not know has a law without a number."""
+    films = np.zeros(len(specimens), dtype=_FILM)
+    numbers = films.view(np.float64).reshape(len(films), _FILM.itemsize // 8)
+    materials = [specimen.material for specimen in specimens]
+    numbers[:, :4] = [(s.disk_radius, s.ring_radius, s.thickness, s.prestretch) for s in specimens]
+    numbers[:, 4] = [m.shear_modulus for m in materials]
+    numbers[:, 5] = [m.eps_r for m in materials]
+    numbers[:, 6] = EPSILON_0 * numbers[:, 5]
+    laws, kinds = films["law"], [(m.law, len(m.mu), len(m.alpha)) for m in materials]
+    for one in set(kinds):
+        law, moduli, shapes = one
+        these = slice(None) if kinds.count(one) == len(kinds) else [i for i, kind in enumerate(kinds) if kind == one]
+        known = law in LAWS and max(moduli, shapes) <= MOST_PARAMETERS
+        laws["kind"][these] = LAWS.index(law) if known else -1
+        if known:
+            some = materials if isinstance(these, slice) else [materials[i] for i in these]
+            laws["moduli"][these], laws["shapes"][these] = moduli, shapes
+            laws["mu"][these, :moduli] = [m.mu for m in some]
+            laws["alpha"][these, :shapes] = [m.alpha for m in some]
+    return films
+
+
 def _film(specimen: Specimen) -> _Film:
-    """A film as the kernel reads it; one that it does not know has a law without a number."""
-    m = specimen.material
-    if m.law not in LAWS or max(len(m.mu), len(m.alpha)) > MOST_PARAMETERS:
-        return _Film(law=_Law(-1))
-    return _Film(
-        specimen.disk_radius,
-        specimen.ring_radius,
-        specimen.thickness,
-        specimen.prestretch,
-        m.shear_modulus,
-        m.eps_r,
-        m.permittivity,
-        _Law(LAWS.index(m.law), len(m.mu), len(m.alpha), m.mu, m.alpha),
-    )
+    """One of them."""
+    return _Film.from_buffer_copy(_films([specimen]).tobytes())
 
 
 # Of the kernel's function: task, films and how many, film of every state, states, h, voltage; answers, unknowns.
@@ -310,6 +318,9 @@ def _slack() -> Any:
 _one_film = lru_cache(maxsize=16)(_film)
 _FIRST = c_int64(0)  # the only film of a call for one state
 _RECORD: np.dtype[Any] = np.dtype(_Answer)
+_FILM: np.dtype[Any] = np.dtype(_Film)
+_WORDS = {name: _RECORD.fields[name][1] // 8 for name in _RECORD.names or ()} if _RECORD.fields else {}
+_SLOPES = {name: _WORDS["dforce"] + getattr(_Slopes, name).offset // 8 for name in (*SLOPES, "mu", "alpha")}
 
 
 def solve_states(
@@ -326,51 +337,71 @@ def solve_states(
     """Write the states (S,) of ``specimens[which]`` into ``result``; tells which are left to others."""
     solver = _solver()
     left = np.ones(len(h), dtype=np.bool_)
-    if solver is None:
+    if solver is None or not specimens:
         return left
-    films = (_Film * len(specimens))(*(_film(specimen) for specimen in specimens))
+    films = _films(specimens) if len(specimens) > 1 else _one_film(specimens[0])
+    where = byref(films) if isinstance(films, _Film) else films.ctypes.data
     for most in TIERS:
         some = np.flatnonzero(left)
         of, hh, vv = which[some].astype(np.int64), h[some].astype(np.float64), voltage[some].astype(np.float64)
         found = np.zeros(len(some), dtype=_RECORD)
         task = _task(tolerance, relaxed, result.dforce is not None, most)
         data = [array.ctypes.data for array in (of, hh, vv, found)]
-        solver(byref(task), films, len(films), data[0], len(some), *data[1:], None)
-        good = found["status"] >= 0
-        _place(result, specimens, which, some[good], found[good])
-        for name in ("mechanical", "electric", "relaxed"):
-            setattr(count, name, getattr(count, name) + int(found[name][good].sum()))
+        solver(byref(task), where, len(specimens), data[0], len(some), *data[1:], None)
+        status = found["status"]
+        good = status >= 0
+        if good.all() and most == 0:
+            _place(result, count, specimens, which, None, found)
+        else:
+            _place(result, count, specimens, which, some[good], found[good])
         left[some[good]] = False
-        if not (found["status"] == NEEDS_TABLE).any():
+        if not (status == NEEDS_TABLE).any():
             break
     return left
 
 
 def _place(
     result: Flat,
+    count: Evaluations,
     specimens: Sequence[Specimen],
     which: NDArray[np.intp],
-    to: NDArray[np.intp],
+    to: NDArray[np.intp] | None,
     found: NDArray[np.void],
 ) -> None:
-    for values in (result.real, result.whole):
-        for name, array in values.items():
-            array[to] = found[name]
-    result.status[to] = found["status"]
-    result.flag["stable"][to] = found["status"] <= 1
+    """Write what is ``found`` of the states ``to``, or of all of them, where copying can be spared."""
+    words = np.ascontiguousarray(found.view(np.float64).reshape(len(found), _RECORD.itemsize // 8).T)
+
+    def put(into: dict[str, Any], name: str, values: NDArray[Any]) -> None:
+        if to is None:
+            into[name] = values
+        else:
+            into[name][to] = values
+
+    for name in result.real:
+        put(result.real, name, words[_WORDS[name]])
+    for name in result.whole:
+        put(result.whole, name, words[_WORDS[name]].view(np.int64).astype(np.intp, copy=False))
+    points = words[_WORDS["mechanical"] : _WORDS["relaxed"] + 1].view(np.int64).sum(axis=1)
+    for name, number in zip(("mechanical", "electric", "relaxed"), points.tolist(), strict=True):
+        setattr(count, name, getattr(count, name) + number)
+    every = slice(None) if to is None else to
+    status = words[_WORDS["status"]].view(np.int64)
+    result.status[every] = status
+    put(result.flag, "stable", status <= 1)
+    of = which[every]
     materials = [specimen.material for specimen in specimens]
-    of = which[to]
     for name, quantity, limits in (
         ("field_exceeded", "peak_field", [m.breakdown_field or math.inf for m in materials]),
         ("stretch_exceeded", "max_stretch", [m.max_stretch or math.inf for m in materials]),
     ):
-        result.flag[name][to] = found[quantity] > np.array(limits)[of]
+        put(result.flag, name, words[_WORDS[quantity]] > np.array(limits)[of])
     if result.dforce is None:
         return
-    slopes = found["dforce"]
     for name in SLOPES:
-        result.dforce[name][to] = slopes[name]
+        put(result.dforce, name, words[_SLOPES[name]])
     for name, given in (("mu", [len(m.mu) for m in materials]), ("alpha", [len(m.alpha) for m in materials])):
         width = result.dforce[name].shape[1]
-        absent = np.arange(width) >= np.array(given, dtype=np.intp)[of][:, None]
-        result.dforce[name][to] = np.where(absent, np.nan, slopes[name][:, :width])
+        slopes = words[_SLOPES[name] : _SLOPES[name] + width].T
+        if min(given) < width:
+            slopes = np.where(np.arange(width) >= np.array(given, dtype=np.intp)[of][:, None], np.nan, slopes)
+        put(result.dforce, name, slopes)

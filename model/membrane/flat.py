@@ -12,34 +12,28 @@ from model.membrane.solution import Solutions, Status
 
 Solved = tuple[Problem, Grid, State, Array]  # states, and their force over its unit
 
+REAL = (
+    *("force", "peak_field", "peak_field_radius", "min_hoop_stress", "min_meridional_stress", "max_stretch"),
+    "error_estimate",
+)
+WHOLE = ("iterations", "modes")
+FLAG = ("stable", "field_exceeded", "stretch_exceeded")
+SLOPES = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
+
 
 class Flat:
     """The results while they are being filled, one entry a state."""
 
     def __init__(self, states: int, moduli: int, shapes: int, sensitivities: bool, keep: bool) -> None:
-        self.real = {
-            name: np.full(states, np.nan)
-            for name in (
-                "force",
-                "peak_field",
-                "peak_field_radius",
-                "min_hoop_stress",
-                "min_meridional_stress",
-                "max_stretch",
-                "error_estimate",
-            )
-        }
-        self.whole = {name: np.zeros(states, dtype=np.intp) for name in ("iterations", "modes")}
-        self.flag = {
-            name: np.zeros(states, dtype=np.bool_) for name in ("stable", "field_exceeded", "stretch_exceeded")
-        }
+        self.real = dict(zip(REAL, np.full((len(REAL), states), np.nan), strict=True))
+        self.whole = dict(zip(WHOLE, np.zeros((len(WHOLE), states), dtype=np.intp), strict=True))
+        self.flag = dict(zip(FLAG, np.zeros((len(FLAG), states), dtype=np.bool_), strict=True))
         self.status = np.full(states, Status.INVALID, dtype=np.int8)
         self.dforce: dict[str, Array] | None = None
         self.keep = keep
         self.kept: list[tuple[NDArray[np.intp], Solved]] = []
         if sensitivities:
-            names = ("h", "voltage", "disk_radius", "ring_radius", "thickness", "prestretch", "eps_r")
-            self.dforce = {name: np.full(states, np.nan) for name in names}
+            self.dforce = dict(zip(SLOPES, np.full((len(SLOPES), states), np.nan), strict=True))
             self.dforce |= {"mu": np.full((states, moduli), np.nan), "alpha": np.full((states, shapes), np.nan)}
 
     def solutions(self, shape: tuple[int, ...], count: Evaluations) -> Solutions:

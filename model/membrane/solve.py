@@ -130,8 +130,9 @@ class _Inputs:
                 grid[:] = list(specimen)
             specimens = list(grid.ravel())
             index = np.arange(len(specimens), dtype=np.intp).reshape(grid.shape)
-        which, hh, vv = np.broadcast_arrays(index, h_array, v_array)
-        return cls(hh.shape, specimens, which.ravel(), hh.ravel(), vv.ravel())
+        shape = np.broadcast(index, h_array, v_array).shape
+        which, hh, vv = (_spread(values, shape) for values in (index, h_array, v_array))
+        return cls(shape, specimens, which, hh, vv)
 
     def profile(self, index: NDArray[np.intp], solved: Solved, x: Array) -> Profile:
         """Profiles of the states at ``index`` at places ``x`` (points, S) of ``ln(R/b)``."""
@@ -166,6 +167,15 @@ class _Inputs:
             for part in np.split(group, cuts):
                 for start in range(0, len(part), BLOCK):
                     yield part[start : start + BLOCK]
+
+
+def _spread(values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Values broadcast to a shape, flat."""
+    if values.shape != shape:
+        spread = np.empty(shape, dtype=values.dtype)
+        spread[...] = values
+        values = spread
+    return values.ravel()
 
 
 def _padded(materials: Sequence[tuple[float, ...]], fill: float) -> Array:
@@ -262,9 +272,10 @@ def _solve(
         inputs_of = inputs.specimens, inputs.which, inputs.h, inputs.voltage
         relaxed = wrinkling == "tension_field"
         wanted = compiled.solve_states(result, count, *inputs_of, tolerance=tolerance, relaxed=relaxed)
-    with np.errstate(all="ignore"):
-        for index in inputs.blocks(wanted):
-            _Block(inputs, index, count).solve(result, tolerance, wrinkling, sensitivities)
+    if wanted.any():
+        with np.errstate(all="ignore"):
+            for index in inputs.blocks(wanted):
+                _Block(inputs, index, count).solve(result, tolerance, wrinkling, sensitivities)
     return result.solutions(inputs.shape, count), result.kept
 
 

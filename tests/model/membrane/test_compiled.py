@@ -214,6 +214,38 @@ def test_order_and_company_change_no_bit() -> None:
     assert alone > 15
 
 
+@pytest.mark.parametrize("wrinkling", ["plain", "tension_field"])
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-8])
+def test_states_side_by_side_have_the_bits_that_they_have_alone(wrinkling: str, tolerance: float) -> None:
+    """One after the other, two at once, and as many as the processor takes: every number of every state."""
+    films, h, voltage = random_films(150, seed=8)
+    laws = [Material(name, mu, alpha, 2.5, law=law) for name, (law, mu, alpha) in LAWS.items()]
+    films += [replace(FILM, material=laws[i % len(laws)], disk_radius=(1 + i) * 1e-4) for i in range(40)]
+    films += [replace(FILM, prestretch=1.0)] * 10
+    h = np.concatenate([h, np.linspace(1e-3, 14e-3, 40), np.linspace(10e-3, 14e-3, 10)])
+    voltage = np.concatenate([voltage, np.linspace(0.0, 1500.0, 40), np.full(10, 1400.0)])
+    which = np.arange(len(films), dtype=np.int64)
+    records = compiled._films(films)
+    found = []
+    for lanes in (1, 2, 0):
+        task = compiled._task(tolerance, wrinkling == "tension_field", True, compiled.MOST_MODES)
+        task = compiled._Task.from_buffer_copy(task)
+        task.lanes = lanes
+        answers = np.zeros(len(films), dtype=np.dtype(compiled._Answer))
+        data = [array.ctypes.data for array in (h, voltage, answers)]
+        solver = compiled._solver()
+        solver(ctypes.byref(task), records.ctypes.data, len(films), which.ctypes.data, len(films), *data, None)
+        found.append(answers)
+    for answers in found:  # points are counted once more where a state goes on alone after all
+        answers["mechanical"] = answers["electric"] = 0
+    for other in found[1:]:
+        np.testing.assert_array_equal(other["status"], found[0]["status"])
+        for i in np.flatnonzero(found[0]["status"] >= 0).tolist():
+            assert other[i].tobytes() == found[0][i].tobytes(), i
+    assert np.count_nonzero(found[0]["status"] == Status.TAUT) > 60
+    assert np.count_nonzero(found[0]["status"] == Status.WRINKLED) > (3 if wrinkling == "tension_field" else 0)
+
+
 def test_a_single_state_has_its_profile_and_capacitance_and_slopes() -> None:
     one = solve(FILM, 10e-3, 1500.0, sensitivities=True)
     assert isinstance(one.quick, compiled.One)

@@ -63,16 +63,19 @@ def run(path: str) -> int:
     solver.restype, solver.argtypes = ctypes.c_int64, compiled.ARGUMENTS
     random = np.random.default_rng(19)
     answered = 0
-    for tolerance in (1e-12, 1e-8, 1e-3):
-        states = STATES // 3
+    for tolerance, lanes in ((1e-12, 1), (1e-8, 2), (1e-8, 4), (1e-3, 4)):
+        states = STATES // 4
         films = random_films(states // 4, random)
         which = random.integers(-2, len(films) + 2, states)
         h = random.choice([-1.0, 1.0], states) * 10.0 ** random.uniform(-4.0, -1.5, states)
         voltage = 10.0 ** random.uniform(0.0, 3.7, states)
         for values in (h, voltage):
             values[random.integers(0, states, states // 20)] = random.choice([0.0, np.nan, np.inf, 1e300, 5e-324])
-        answers, kept = np.zeros(states, dtype=np.dtype(compiled._Answer)), (compiled._Kept * states)()
+        answers = np.zeros(states, dtype=np.dtype(compiled._Answer))
+        kept = (compiled._Kept * states)() if lanes == 1 else None
         task = compiled._task(tolerance, bool(tolerance < 1e-6), True, compiled.MOST_MODES)
+        task = compiled._Task.from_buffer_copy(task)
+        task.lanes = lanes
         pointers = [array.ctypes.data for array in (h, voltage, answers)]
         films = np.ascontiguousarray(films)
         solver(ctypes.byref(task), films.ctypes.data, len(films), which.ctypes.data, states, *pointers, kept)
