@@ -25,7 +25,7 @@ from calibration.film.planning import Places, one_term
 from calibration.film.result import Identification, Quantity
 from model.specimen import Specimen
 from rig.scene.scene import Scene
-from rig.steps.advisor import Advice, Ask, Kind
+from rig.steps.advisor import Advice, Ask, Kind, Standing
 from rig.steps.places import connected
 from rig.steps.wanted import BY_TIME, Wanted
 
@@ -72,7 +72,8 @@ class Learner:
         if found is None or any(one.name not in found.quantities for one in self.wanted):
             return self._next(curves, found, question, {}, "first places: there is no fit yet")
         worst = max(self.wanted, key=lambda one: stands[one.name][0] / one.relative)
-        told = _about(worst, found.quantities[worst.name], stands[worst.name][0])
+        known = tuple(_standing(one, found.quantities[one.name], stands[one.name][0]) for one in self.wanted)
+        told = _about(known[self.wanted.index(worst)], known)
         missing = [one for one in self.wanted if stands[one.name][0] > one.relative]
         lost = [one for one in missing if stands[one.name][1] > one.relative]
         self._hopeless = self._hopeless + 1 if lost else 0
@@ -81,7 +82,7 @@ class Learner:
             worst = lost[0]
             part, size = _largest(found.quantities[worst.name], worst)
             reason = f"{worst} cannot be reached by more time: {part} alone leaves {100 * size:.3g} %"
-            told = _about(worst, found.quantities[worst.name], stands[worst.name][0])
+            told = _about(known[self.wanted.index(worst)], known)
             return replace(told, kind=Kind.UNREACHABLE, reason=reason)
         if self._met > 1:
             return replace(told, kind=Kind.MET, reason="known well enough, and so said the fit before")
@@ -173,17 +174,13 @@ def believed_film(specimen: Specimen, terms: int) -> Specimen:
     return specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
 
 
-def _about(wanted: Wanted, quantity: Quantity, relative: float) -> Advice:
-    """An advice that says how well a quantity is known, and so far nothing else."""
-    return Advice(
-        Kind.GO,
-        "",
-        quantity=wanted.name,
-        value=quantity.value,
-        standard_uncertainty=relative * abs(quantity.value),
-        relative=relative,
-        wanted=wanted.relative,
-    )
+def _standing(wanted: Wanted, quantity: Quantity, relative: float) -> Standing:
+    return Standing(wanted.name, quantity.value, relative * abs(quantity.value), relative, wanted.relative)
+
+
+def _about(one: Standing, known: tuple[Standing, ...]) -> Advice:
+    """An advice that says how well a quantity is known, and the others, and so far nothing else."""
+    return Advice(Kind.GO, "", **one.__dict__, known=known)
 
 
 def _largest(quantity: Quantity, wanted: Wanted) -> tuple[str, float]:

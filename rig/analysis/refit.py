@@ -1,8 +1,8 @@
 """The process that fits for a closed loop: ``python -m rig.analysis.refit``, started by `rig.analysis.refitting`.
 
 It reads one line of JSON with the logs and the step, then a line for every question, and answers each with one line:
-the fields of an `rig.steps.advisor.Advice`. It reads the log that the run is writing, and nothing else. It ends when
-its input does.
+the fields of an `rig.steps.advisor.Advice`, and under ``known`` those of each `rig.steps.advisor.Standing`. It reads
+the log that the run is writing, and nothing else. It ends when its input does.
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ def main() -> None:
             refit = Refit(**told)
             continue
         advice = refit.answer(Ask(**told))
-        sys.stdout.write(json.dumps(advice.as_fields()) + "\n")
+        known = [one.as_fields() for one in advice.known]
+        sys.stdout.write(json.dumps(advice.as_fields() | {"known": known}) + "\n")
         sys.stdout.flush()
 
 

@@ -152,6 +152,6 @@ class RefitProcess:
 def _advice(line: bytes) -> Advice:
     try:
         fields: dict[str, Any] = json.loads(line)
-        return Advice.from_fields(fields)
+        return Advice.from_fields(fields, fields["known"])
     except (ValueError, KeyError, TypeError) as error:
         return Advice(Kind.FAILED, f"the process that fits says what is no answer ({error!r})")

@@ -219,6 +219,10 @@ class Recorder:
         """Write what a closed loop does next, and why."""
         self._write("/decision", self._clock.now(), about=None, **fields)
 
+    def standing(self, fields: Mapping[str, object]) -> None:
+        """Write how well one of the quantities is known that a closed loop is to find."""
+        self._write("/standing", self._clock.now(), about=None, **fields)
+
     def cycle(self, fields: Mapping[str, object]) -> None:
         """Write the summary of a cycle that has ended."""
         self._write("/cycle", self._clock.now(), about=None, **fields)

@@ -182,6 +182,20 @@ CHANNELS: dict[str, Channel] = {
             Field("expected_s", "double", "seconds that it will still take, as far as can be told; NaN: cannot"),
         ),
     ),
+    "/standing": Channel(
+        "Standing",
+        (
+            _T,
+            Field("step", "uint32", "index of the protocol step that decides"),
+            Field("number", "uint32", "of the decision that this stands behind"),
+            Field("quantity", "string", "one of those wanted"),
+            Field("value", "double", "by the fit so far, in `unit`"),
+            Field("standard_uncertainty", "double", "its standard uncertainty, of the parts that count, in `unit`"),
+            Field("unit", "string", "unit of value and uncertainty"),
+            Field("relative_uncertainty", "double", "the uncertainty over the value"),
+            Field("wanted_uncertainty", "double", "relative standard uncertainty that is wanted"),
+        ),
+    ),
     "/cycle": Channel(
         "Cycle",
         (

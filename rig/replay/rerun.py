@@ -187,6 +187,7 @@ class _Advisor:
 
     def __init__(self, recording: Recording) -> None:
         self._decisions = deque(row for row in recording.rows if row.topic == "/decision")
+        self._standings = [row.fields for row in recording.rows if row.topic == "/standing"]
         # Led through its turns, the clock shows when the turn began in which the answer came.
         self._early = NANOSECONDS if recording.in_virtual_time else LONGEST_TURN_S
 
@@ -196,7 +197,10 @@ class _Advisor:
     def answer(self, now: float, stopping: Callable[[], bool]) -> Advice | None:
         if not self._decisions or now < self._decisions[0].t - self._early:
             return None
-        return Advice.from_fields(self._decisions.popleft().fields)
+        fields = self._decisions.popleft().fields
+        belongs = (fields["step"], fields["number"])
+        known = [one for one in self._standings if (one["step"], one["number"]) == belongs]
+        return Advice.from_fields(fields, known)
 
     def close(self) -> None:
         """Nothing is open."""

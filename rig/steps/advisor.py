@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol
@@ -44,6 +44,39 @@ class Ask:
 
 
 @dataclass(frozen=True)
+class Standing:
+    """How well one of the quantities that are wanted is known, SI units, by the parts of the uncertainty that count.
+
+    ``relative`` is its standard uncertainty over its value, ``wanted`` what of that is wanted.
+    """
+
+    quantity: str
+    value: float
+    standard_uncertainty: float
+    relative: float
+    wanted: float
+
+    @property
+    def met(self) -> bool:
+        """Whether it is known as well as wanted."""
+        return self.relative <= self.wanted
+
+    def as_fields(self) -> dict[str, str | float]:
+        """As ``/standing`` of the log has it."""
+        return {there: getattr(self, here) for here, there in _KNOWN.items()} | {"unit": unit_of(self.quantity)}
+
+    @classmethod
+    def from_fields(cls, fields: Mapping[str, Any]) -> Standing:
+        """What a row of ``/standing`` says."""
+        return cls(**{here: fields[there] for here, there in _KNOWN.items()})
+
+
+def unit_of(quantity: str) -> str:
+    """Of a quantity; empty where there is none."""
+    return {"": "", "eps_r": "1"}.get(quantity, "Pa")
+
+
+@dataclass(frozen=True)
 class Advice:
     """An answer, SI units.
 
@@ -62,6 +95,8 @@ class Advice:
         Its relative standard uncertainty and what is wanted.
     expected_s : float
         Seconds that it will still take as far as can be told; NaN where it cannot.
+    known : tuple of Standing
+        All quantities that are wanted, in the order of the wish; empty before there is a fit of them all.
     """
 
     kind: Kind
@@ -75,6 +110,7 @@ class Advice:
     relative: float = math.nan
     wanted: float = math.nan
     expected_s: float = math.nan
+    known: tuple[Standing, ...] = ()
 
     def as_fields(self) -> dict[str, str | float]:
         """As ``/decision`` of the log has it."""
@@ -82,14 +118,15 @@ class Advice:
         return told | {"outcome": str(self.kind), "unit": self.unit}
 
     @classmethod
-    def from_fields(cls, fields: Mapping[str, Any]) -> Advice:
-        """What a row of ``/decision`` says."""
-        return cls(Kind(fields["outcome"]), **{here: fields[there] for here, there in _FIELDS.items()})
+    def from_fields(cls, fields: Mapping[str, Any], known: Iterable[Mapping[str, Any]] = ()) -> Advice:
+        """What a row of ``/decision`` says, and those of ``/standing`` that belong to it."""
+        told = {here: fields[there] for here, there in _FIELDS.items()}
+        return cls(Kind(fields["outcome"]), **told, known=tuple(Standing.from_fields(one) for one in known))
 
     @property
     def unit(self) -> str:
         """Of the quantity; empty before there is one."""
-        return {"": "", "eps_r": "1"}.get(self.quantity, "Pa")
+        return unit_of(self.quantity)
 
     @property
     def standing(self) -> str:
@@ -111,6 +148,13 @@ _FIELDS = {
     "relative": "relative_uncertainty",
     "wanted": "wanted_uncertainty",
     "expected_s": "expected_s",
+}
+_KNOWN = {
+    "quantity": "quantity",
+    "value": "value",
+    "standard_uncertainty": "standard_uncertainty",
+    "relative": "relative_uncertainty",
+    "wanted": "wanted_uncertainty",
 }
 
 

@@ -17,7 +17,7 @@ from pydantic import Field, field_validator
 
 from rig.base.errors import FaultError, LimitError
 from rig.scene.scene import Scene
-from rig.steps.advisor import Advice, Ask, Kind
+from rig.steps.advisor import Advice, Ask, Kind, Standing, unit_of
 from rig.steps.base import Action, NotNegative, Positive, State, Step, Turns, write_phase
 from rig.steps.moves import move_to, ramp_duration, voltage_to
 from rig.steps.places import connected
@@ -149,6 +149,7 @@ class _Loop:
         self._before = before.reference
         self.number = before.count
         self._failures = 0
+        self._known: tuple[Standing, ...] = ()  # by the newest fit
         # Where the disk is: after a pause, somewhere at 0 V.
         measured = rig.recorder.displacement
         begin = action.h[0]
@@ -216,7 +217,10 @@ class _Loop:
     def _tell(self, advice: Advice) -> None:
         rig = self._rig
         told = {"step": self._action.step, "number": self.number, "spent_s": self.spent}
+        for one in advice.known:  # before the decision, so that no row of it comes without them
+            rig.recorder.standing({"step": self._action.step, "number": self.number, **one.as_fields()})
         rig.recorder.decision({**told, **advice.as_fields()})
+        self._known = advice.known or self._known
         words = ". ".join(one for one in (advice.standing, advice.reason) if one)
         if advice.kind is Kind.GO:
             rig.doing = advice.standing
@@ -226,16 +230,12 @@ class _Loop:
             rig.recorder.event("warning", "fit", advice.reason)
 
     def _result(self, advice: Advice) -> None:
-        if advice.quantity:
-            self._rig.recorder.result(
-                self._action.step,
-                self._action.kind,
-                str(advice.kind),
-                advice.quantity,
-                advice.value,
-                advice.standard_uncertainty,
-                advice.unit,
-            )
+        """All that was wanted, by the newest fit, in the order of the wish."""
+        action, recorder = self._action, self._rig.recorder
+        for one in self._known:
+            outcome, unit = str(Kind.MET if one.met else advice.kind), unit_of(one.quantity)
+            error = one.standard_uncertainty
+            recorder.result(action.step, action.kind, outcome, one.quantity, one.value, error, unit)
 
     def _go(self, advice: Advice) -> Turns:
         """At the lower of the two voltages: that the film bears."""
@@ -277,4 +277,5 @@ def _out_of_time(last: Advice) -> Advice:
         standard_uncertainty=last.standard_uncertainty,
         relative=last.relative,
         wanted=last.wanted,
+        known=last.known,
     )

@@ -57,6 +57,17 @@ SAMPLES: dict[str, dict[str, Any]] = {
         "spent_s": 31.5,
         "expected_s": 40.0,
     },
+    "/standing": {
+        "t_s": 12.0,
+        "step": 5,
+        "number": 2,
+        "quantity": "stiffness",
+        "value": 1.2e5,
+        "standard_uncertainty": 900.0,
+        "unit": "Pa",
+        "relative_uncertainty": 0.0075,
+        "wanted_uncertainty": 0.01,
+    },
     "/result": {
         "step": 4,
         "kind": "breakdown",

@@ -30,7 +30,7 @@ from rig.replay.rerun import rerun
 from rig.run.resume import prepare_resumed
 from rig.run.run import run
 from rig.scene.scene import load_scene
-from rig.steps.advisor import Advice, Ask, Kind
+from rig.steps.advisor import Advice, Ask, Kind, Standing
 from rig.steps.learn import FAILURES, Learning
 from rig.steps.places import connected
 from rig.steps.wanted import BY_TIME, STATED, Counts, parse_wanted
@@ -78,8 +78,9 @@ class Scripted:
 
 
 def go(h: float, voltage: float, hold_s: float = 1.0, relative: float = 0.02) -> Advice:
-    known = {"quantity": "eps_r", "value": 1.7, "standard_uncertainty": 1.7 * relative, "relative": relative}
-    return Advice(Kind.GO, "tells most per second", h, voltage, hold_s, wanted=0.01, **known)
+    told = {"quantity": "eps_r", "value": 1.7, "standard_uncertainty": 1.7 * relative, "relative": relative}
+    known = (Standing("stiffness", 1.2e5, 1.2e3, 0.01, 0.008), Standing(**told, wanted=0.01))
+    return Advice(Kind.GO, "tells most per second", h, voltage, hold_s, wanted=0.01, **told, known=known)
 
 
 def ends(kind: Kind) -> Advice:
@@ -173,10 +174,10 @@ def test_it_goes_where_it_is_told_says_why_and_ends_at_0_V(
     h1, h2 = places[high][3], places[low][8]
     out = tmp_path / "run.mcap"
     wrong = go(h1 + 1e-4, high)
-    advisor = carry_out(experiment, out, [go(h1, high), wrong, go(h2, low), ends(Kind.MET)])
+    advisor = carry_out(experiment, out, [go(h1, high), wrong, go(h2, low), ends(Kind.TIME)])
     log, measured = read_log(out), load_run(out)
     rows = [message.fields for message in log.messages("/decision")]
-    assert [row["outcome"] for row in rows] == ["go", "failed", "go", "met"]
+    assert [row["outcome"] for row in rows] == ["go", "failed", "go", "time"]
     assert [row["number"] for row in rows] == [1, 2, 3, 4]
     assert "no place that was checked" in rows[1]["reason"]
     assert (rows[0]["displacement_m"], rows[0]["voltage_V"]) == (h1, high)
@@ -190,8 +191,13 @@ def test_it_goes_where_it_is_told_says_why_and_ends_at_0_V(
     assert abs(log.columns("/hv/sample")["voltage_V"][-1]) < 60.0
     moved = np.abs(np.diff(measured.h)) > 2e-5  # the disk moves at the lower voltage of the two
     assert np.nanmax(measured.voltage[1:][moved & (measured.h[1:] > 1e-3)]) < 1.02 * low + 20.0
-    (result,) = [message.fields for message in log.messages("/result")]
-    assert (result["name"], result["outcome"], result["value"]) == ("eps_r", "met", 1.7)
+    results = [message.fields for message in log.messages("/result")]  # all that was wanted, not only the last to come
+    told = [(one["name"], one["outcome"], one["value"], one["unit"]) for one in results]
+    assert told == [("stiffness", "time", 1.2e5, "Pa"), ("eps_r", "met", 1.7, "1")]
+    assert [one["standard_uncertainty"] for one in results] == pytest.approx([1.2e3, 1.7 * 0.009])
+    standings = [message.fields for message in log.messages("/standing")]
+    assert [(one["number"], one["quantity"]) for one in standings][-2:] == [(4, "stiffness"), (4, "eps_r")]
+    assert [one["wanted_uncertainty"] for one in standings][-2:] == [0.008, 0.01]
     curves = measured.curves(experiment.scene.specimen.specimen(), {"learn"}, force_noise=5e-3)
     assert {curve.nominal_voltage for curve in curves} == {0.0, low, high}
     assert [one.voltage for one in advisor.questions] == [0.0, high, high, low]
