@@ -20,7 +20,7 @@ from drivers.roles import HVSample, MonitorSample, Sample
 from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.base.host import HostTime
 from rig.bench.bench import Bench
-from rig.engine.lent import Lent, wait_given_back
+from rig.engine.lent import Kept, Lent, wait_given_back
 from rig.engine.look import Outlook
 from rig.engine.outcome import NOT_SAFE_STATUS, Outcome
 from rig.engine.pause import pause
@@ -91,6 +91,8 @@ class Engine:
         ``show(status)`` about five times a second, before ``progress``; as that, it must return at once.
     advisor : Advisor, optional
         Who fits for a closed loop.
+    kept : Kept, optional
+        Where what the run changes in instruments is kept, should it be killed; files of the user by default.
     """
 
     def __init__(
@@ -107,6 +109,7 @@ class Engine:
         guard_process: RemoteGuard | None = None,
         show: Callable[[Status], None] | None = None,
         advisor: Advisor | None = None,
+        kept: Kept | None = None,
     ) -> None:
         self.bench = bench
         self.clock = bench.clock
@@ -125,7 +128,7 @@ class Engine:
         self._show_status = show
         self._outlook = Outlook(self.rig, actions, max((action.step for action in actions), default=0))
         self._host = HostTime(self.clock)
-        self._lent = Lent(bench, self.recorder)
+        self._lent = Lent(bench, self.recorder, kept)
         self._beats = 0
         self._next_beat = -math.inf
         self._watch: Watch | None = None

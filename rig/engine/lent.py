@@ -10,13 +10,14 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 from drivers.links.own_directory import remove_if_empty, user_directory
-from drivers.roles import GivesBack
+from drivers.roles import GivesBack, Identity
 from rig.base.errors import ConfigError
 from rig.base.outputs import write_text
 from rig.bench.bench import Bench
@@ -27,22 +28,64 @@ GIVE_BACK_S = 1.0  # how long an instrument may take to confirm that it has its 
 LARGEST = 4096  # bytes of such a file
 
 
-class Lent:
-    """What one run has of the instruments that the engine's loop owns."""
+class Kept(Protocol):
+    """Where a run keeps what it has found, by role and instrument, should it be killed."""
 
-    def __init__(self, bench: Bench, recorder: Recorder) -> None:
+    def left(self, role: str, who: Identity) -> Mapping[str, float]:
+        """What a killed run has left there; empty where none has."""
+        ...
+
+    def keep(self, role: str, who: Identity, found: Mapping[str, float]) -> None:
+        """Keep it. Raises OSError or `ConfigError` where that cannot be."""
+        ...
+
+    def forget(self, role: str) -> None:
+        """The instrument has confirmed that it has everything back. Never raises."""
+        ...
+
+
+class UsersFiles:
+    """In files of the user's own directory, one an instrument."""
+
+    def __init__(self) -> None:
+        self._paths: dict[str, Path] = {}
+
+    def left(self, role: str, who: Identity) -> Mapping[str, float]:
+        return _read(self._path(role, who))
+
+    def keep(self, role: str, who: Identity, found: Mapping[str, float]) -> None:
+        path = self._path(role, who)
+        write_text(path, json.dumps(dict(found)) + "\n")
+        self._paths[role] = path
+
+    def forget(self, role: str) -> None:
+        path = self._paths.get(role)
+        if path is not None:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+                remove_if_empty(path.parent)
+
+    @staticmethod
+    def _path(role: str, who: Identity) -> Path:
+        return user_directory() / f"{role}-{_plain(who.model)}-{_plain(who.serial)}.json"
+
+
+class Lent:
+    """What one run has of the instruments that the engine's loop owns; ``kept`` where, should it be killed."""
+
+    def __init__(self, bench: Bench, recorder: Recorder, kept: Kept | None = None) -> None:
         self._bench = bench
         self._recorder = recorder
-        self._paths: dict[str, Path] = {}
+        self._kept = kept or UsersFiles()
+        self._replayed = kept is not None  # then the ports of the recorded run may not be in the scene
 
     def begin(self) -> None:
         """After set-up, before anything moves: look what a killed run has left, and keep what there is."""
         for role, device in self._lenders().items():
-            if self._bench.scene.instruments[role].connected:
+            if self._replayed or self._bench.scene.instruments[role].connected:
                 try:
                     self._begin(role, device)
                 except (OSError, ConfigError) as error:
-                    self._paths.pop(role, None)
                     what = "what this run changes is not kept in a file, should it be killed"
                     self._recorder.event("warning", role, f"{what} ({error})")
 
@@ -50,16 +93,13 @@ class Lent:
         if not device.found:
             return
         who = self._bench.devices[role].identity
-        path = user_directory() / f"{role}-{_plain(who.model)}-{_plain(who.serial)}.json"
-        left = device.resume_found(_read(path))
+        left = device.resume_found(self._kept.left(role, who))
         if left:
-            now_found = ", ".join(f"{key} {value}" for key, value in device.found.items())
-            self._recorder.command(role, "resume_found", now_found)
+            self._recorder.command(role, "resume_found", as_argument(device.found))
             what = ", ".join(f"{key} {now}, before {before}" for key, (now, before) in left.items())
             message = f"an earlier run was killed and left changed: {what}; given back after this one"
             self._recorder.event("warning", role, message)
-        write_text(path, json.dumps(dict(device.found)) + "\n")
-        self._paths[role] = path
+        self._kept.keep(role, who, device.found)
 
     def end(self, standing: bool) -> None:
         """Give everything back, and wait a little for each one's word that it has it. Never raises."""
@@ -70,18 +110,26 @@ class Lent:
                 self._recorder.command(role, "give_back", "")
                 done = partial(getattr, device, "given_back")
                 wait_given_back(role, device.give_back, done, self._bench, self._recorder)
-            path = self._paths.get(role)
             if not device.given_back:  # the driver's close tries once more, without waiting
                 self._recorder.event("warning", role, "it has not confirmed that its settings are as they were found")
-            elif path is not None:
-                with suppress(OSError):
-                    path.unlink(missing_ok=True)
-                    remove_if_empty(path.parent)
+            else:
+                self._kept.forget(role)
 
     def _lenders(self) -> dict[str, GivesBack]:
         """By role; what the supply has to get back its guard sees to."""
         devices = self._bench.devices.items()
         return {role: device for role, device in devices if role != ROLE and isinstance(device, GivesBack)}
+
+
+def as_argument(found: Mapping[str, float]) -> str:
+    """Settings as the argument of a command in the log."""
+    return ", ".join(f"{key} {value}" for key, value in found.items())
+
+
+def from_argument(text: str) -> dict[str, float]:
+    """The settings that `as_argument` wrote."""
+    pairs = (one.rsplit(" ", 1) for one in text.split(", ") if one)
+    return {key: float(value) for key, value in pairs}
 
 
 def wait_given_back(

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
+from drivers.roles import Identity
 from rig.bench.bench import Bench
 from rig.bench.opening import open_memory
 from rig.engine.engine import LONGEST_TURN_S, Engine
+from rig.engine.lent import from_argument
 from rig.engine.outcome import Outcome
 from rig.log.nowhere import NoLog
 from rig.operator.control import Answer, Control, Question
@@ -103,6 +105,7 @@ def rerun(recording: Recording, *, steered: bool | None = None) -> Rerun:
         requested=AS_RECORDED,
         take_down=AS_RECORDED if operator.took_down else "",
         advisor=_Advisor(recording),
+        kept=_Kept(recording),
     )
     try:
         outcome, _ = engine.run()
@@ -204,6 +207,23 @@ class _Advisor:
 
     def close(self) -> None:
         """Nothing is open."""
+
+
+class _Kept:
+    """What killed runs had left then. Nothing is kept: a replay leaves the files of real runs alone."""
+
+    def __init__(self, recording: Recording) -> None:
+        taken = [row.fields for row in recording.rows if row.topic == "/command"]
+        self._left = {f["device"]: from_argument(f["argument"]) for f in taken if f["command"] == "resume_found"}
+
+    def left(self, role: str, who: Identity) -> Mapping[str, float]:
+        return self._left.get(role, {})
+
+    def keep(self, role: str, who: Identity, found: Mapping[str, float]) -> None:
+        """Nowhere."""
+
+    def forget(self, role: str) -> None:
+        """Nothing is kept."""
 
 
 class _Again(ReplayBench):
