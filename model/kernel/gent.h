@@ -5,7 +5,7 @@ static Real gent_inverse(Real share) { return pick(share < 1.0, 1.0 / (1.0 - sha
 static void gent_derivatives(const Law *law, int64_t n, const Real *log, Stress *out) {
     Real squares[3 * MOST_STATIONS], total[MOST_STATIONS], first[MOST_STATIONS], second[MOST_STATIONS];
     invariant(n, log, squares, total);
-    for (int64_t i = 0; i < n; i++) {
+    for (int64_t i = 0; i < n; i++) { /* vector */
         Real inverse = gent_inverse(total[i] / law->alpha[0]);
         first[i] = 0.5 * law->mu[0] * inverse;
         second[i] = first[i] * inverse / law->alpha[0];

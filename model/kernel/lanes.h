@@ -2,7 +2,8 @@
 
    A source says Real where every state has a number of its own, and Mask where it has a yes or no; with LANES 1, as in
    membrane.c, they are double and int. Lanes never meet, and every operation rounds as it does alone, so that a state
-   has the same digits in any lane, beside any others, and with any number of lanes. */
+   has the same digits in any lane, beside any others, and with any number of lanes. A loop marked "vector" becomes one
+   where a state is alone too: a test reads what the compiler says of it. */
 #ifndef DEA_LANES_H
 #define DEA_LANES_H
 

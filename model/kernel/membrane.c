@@ -150,10 +150,10 @@ static int is_doubtful(const Extremes *x) { return !(x->meridional > 0.0) || !(x
 static int64_t wrinkled_answer(const Task *task, const Film *film, Problem *problem, double h, double voltage,
                                Iterate *found, const Grid *grid, const State *state, Answer *out, Kept *kept) {
     Cut cut;
-    Points plain, at[MOST_ELEMENTS];
+    Points at[MOST_ELEMENTS];
     Extremes x;
-    evaluate(problem, grid, state, NULL, &plain);
-    int status = fold(problem, task->tables, task->first_modes, task->tolerance, grid, state, &plain, &cut, at, found,
+    evaluate(problem, grid, state, NULL, &at[0]);
+    int status = fold(problem, task->tables, task->first_modes, task->tolerance, grid, state, at, &cut, found,
                       &out->error_estimate);
     if (status != WRINKLED) return status;
     Solved solved = {cut.elements, cut.grid, at, cut.folded};

@@ -7,19 +7,19 @@ static void ogden_derivatives(const Law *law, int64_t n, const Real *log, Stress
     Real a[3 * MOST_STATIONS]; /* sum mu al l^al */
     Real twice_shear = of(0.0);
     for (int64_t k = 0; k < law->moduli; k++) twice_shear += law->mu[k] * law->alpha[k];
-    for (int64_t i = 0; i < 3 * n; i++) {
+    for (int64_t i = 0; i < 3 * n; i++) { /* vector */
         m[i] = of(0.0);
         a[i] = twice_shear;
     }
     for (int64_t k = 0; k < law->moduli; k++) {
         Real mu = law->mu[k], alpha = law->alpha[k];
-        for (int64_t i = 0; i < 3 * n; i++) {
+        for (int64_t i = 0; i < 3 * n; i++) { /* vector */
             Real term = mu * expm1_of(alpha * log[i]);
             m[i] += term;
             a[i] += alpha * term;
         }
     }
-    for (int64_t i = 0; i < n; i++) {
+    for (int64_t i = 0; i < n; i++) { /* vector */
         out->t1[i] = m[i] - m[2 * n + i];
         out->t2[i] = m[n + i] - m[2 * n + i];
         out->h11[i] = a[i] + a[2 * n + i];
@@ -31,14 +31,14 @@ static void ogden_derivatives(const Law *law, int64_t n, const Real *log, Stress
 static void ogden_projected(const Law *law, int64_t n, const Real *log, const Real *rate1, const Real *rate2,
                             Real *by_mu, Real *by_alpha) {
     Real rates[3 * MOST_STATIONS], powers[3 * MOST_STATIONS];
-    for (int64_t i = 0; i < n; i++) {
+    for (int64_t i = 0; i < n; i++) { /* vector */
         rates[i] = rate1[i];
         rates[n + i] = rate2[i];
         rates[2 * n + i] = -(rate1[i] + rate2[i]);
     }
     for (int64_t k = 0; k < law->moduli; k++) {
         Real alpha = law->alpha[k], of_mu = of(0.0), of_alpha = of(0.0);
-        for (int64_t i = 0; i < 3 * n; i++) powers[i] = expm1_of(alpha * log[i]);
+        for (int64_t i = 0; i < 3 * n; i++) powers[i] = expm1_of(alpha * log[i]); /* vector */
         for (int64_t i = 0; i < 3 * n; i++) {
             of_mu += powers[i] * rates[i];
             of_alpha += (powers[i] + 1.0) * log[i] * rates[i];

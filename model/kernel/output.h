@@ -135,7 +135,7 @@ static void series(int64_t n, const Real *c, Real xi, Real *value, Real *slope, 
 static void refined(const Table *table, const Real *values, Real *fine) {
     for (int64_t k = 0; k < FINE; k++) fine[k] = of(0.0);
     for (int64_t i = 0; i < table->points; i++)
-        for (int64_t k = 0; k < FINE; k++) fine[k] += values[i] * table->fine[i * FINE + k];
+        for (int64_t k = 0; k < FINE; k++) fine[k] += values[i] * table->fine[i * FINE + k]; /* vector */
 }
 
 /* A place between two others. */
@@ -149,7 +149,7 @@ static Real peak(const Table *table, const Real *values, Bracket *place) {
     Real c[MOST_POINTS], value, slope, curve, step = of(0.0);
     for (int64_t k = 0; k < n; k++) c[k] = of(0.0);
     for (int64_t i = 0; i < n; i++)
-        for (int64_t k = 0; k < n; k++) c[k] += values[i] * table->legendre[i * n + k];
+        for (int64_t k = 0; k < n; k++) c[k] += values[i] * table->legendre[i * n + k]; /* vector */
     for (int64_t k = 0; k < POLISH; k++) {
         series(n, c, place->xi, &value, &slope, &curve);
         Real aim = pick(curve < 0.0, place->xi - slope / curve, place->xi);

@@ -67,7 +67,7 @@ static Real advance(const Problem *problem, const Grid *grid, const Points *at, 
     }
     Real part = pick(change > 2.0, 2.0 / change, of(1.0));
     open &= finite(sum);
-    for (int64_t i = 0; i < points; i++) {
+    for (int64_t i = 0; i < points; i++) { /* vector */
         Real w = state->w[i], moved = w + part * step->dw[i];
         moved = pick((change > 0.8) & is_not(moved > 0.2 * w), 0.2 * w, moved);
         state->w[i] = pick(open, moved, w);

@@ -106,7 +106,7 @@ static void lay(Grid *grid, const Table *table, int64_t functions, Real left, Re
     grid->left = left;
     grid->right = right;
     grid->dxi = 1.0 / half;
-    for (int64_t i = 0; i < table->points; i++) {
+    for (int64_t i = 0; i < table->points; i++) { /* vector */
         Real radius = exp_of(half * (table->xi[i] - 1.0) + right);
         Real once = table->weight[i] * half * radius;
         grid->radius[i] = radius;
@@ -121,12 +121,12 @@ static void strain(const Grid *grid, const Real *c, Real *e, Real *q) {
     for (int64_t i = 0; i < points; i++) e[i] = q[i] = of(0.0);
     for (int64_t k = 0; k < grid->functions; k++) {
         const double *value = grid->table->values + k * points, *slope = value + every * points;
-        for (int64_t i = 0; i < points; i++) {
+        for (int64_t i = 0; i < points; i++) { /* vector */
             e[i] += c[k] * value[i];
             q[i] += c[k] * slope[i];
         }
     }
-    for (int64_t i = 0; i < points; i++) q[i] = q[i] * grid->dxi + e[i];
+    for (int64_t i = 0; i < points; i++) q[i] = q[i] * grid->dxi + e[i]; /* vector */
 }
 
 /* True stress dW-star/dL_i and its tangent: the law's, less the Maxwell stress k exp(2 (L1 + L2)). */
@@ -137,7 +137,7 @@ static void stress(Problem *problem, int64_t n, const Real *log, Stress *out) {
     Mask charged = problem->field != 0.0;
     if (!any(charged)) return;
     problem->electric += counted(problem->counts & charged, n);
-    for (int64_t i = 0; i < n; i++) {
+    for (int64_t i = 0; i < n; i++) { /* vector */
         Real b = pick(charged, problem->field * exp_of(-2.0 * log[2 * n + i]), of(0.0));
         out->maxwell[i] = b;
         out->t1[i] -= b;
@@ -152,7 +152,7 @@ static void stress(Problem *problem, int64_t n, const Real *log, Stress *out) {
    dL2 = change + rate dL1; returns whether a natural hoop stretch exists everywhere. */
 static Mask relax(int64_t n, Stress *law, Real *change, Real *rate) {
     Mask regular = yes();
-    for (int64_t i = 0; i < n; i++) {
+    for (int64_t i = 0; i < n; i++) { /* vector */
         regular &= law->h22[i] > 0.0;
         rate[i] = -law->h12[i] / law->h22[i];
         change[i] = -law->t2[i] / law->h22[i];
@@ -167,7 +167,7 @@ static Mask relax(int64_t n, Stress *law, Real *change, Real *rate) {
 static void evaluate(Problem *problem, const Grid *grid, const State *state, const Real *natural, Points *at) {
     int64_t n = grid->table->points;
     strain(grid, state->c, at->e, at->q);
-    for (int64_t i = 0; i < n; i++) {
+    for (int64_t i = 0; i < n; i++) { /* vector */
         Real e = at->e[i], q = at->q[i], w = state->w[i], g = (q + 2.0) * q + w * w;
         at->metric[i] = g + 1.0;
         at->along[i] = (q + 1.0) / (g + 1.0);
@@ -176,8 +176,8 @@ static void evaluate(Problem *problem, const Grid *grid, const State *state, con
         at->log[i] = g;
         at->log[n + i] = e;
     }
-    for (int64_t i = 0; i < 2 * n; i++) at->log[i] = log1p_of(at->log[i]);
-    for (int64_t i = 0; i < n; i++) {
+    for (int64_t i = 0; i < 2 * n; i++) at->log[i] = log1p_of(at->log[i]); /* vector */
+    for (int64_t i = 0; i < n; i++) { /* vector */
         Real log1 = 0.5 * at->log[i] + problem->log_prestretch;
         at->hoop[i] = at->log[n + i] + problem->log_prestretch;
         Real log2 = natural ? natural[i] : at->hoop[i];
@@ -205,23 +205,26 @@ static void assemble(const Table *table, int64_t functions, const Weights *on, R
     for (int64_t i = 0; i < table->points; i++) {
         const double *value = table->project + 2 * i * every, *slope = value + every;
         Real c0 = on->coupling[0][i], c1 = on->coupling[1][i], r0 = on->residual[0][i], r1 = on->residual[1][i];
-        for (int64_t k = 0; k < functions; k++) {
+        for (int64_t k = 0; k < functions; k++) { /* vector */
             system->coupling[k] += c0 * value[k] + c1 * slope[k];
             system->residual[k] += r0 * value[k] + r1 * slope[k];
         }
         const double *both = table->pairs + 3 * i * stride, *mixed = both + stride, *slopes = mixed + stride;
         Real m0 = on->pair[0][i], m1 = on->pair[1][i], m2 = on->pair[2][i];
-        for (int64_t p = 0; p < pairs; p++) system->matrix[p] += m0 * both[p] + m1 * mixed[p] + m2 * slopes[p];
+        for (int64_t p = 0; p < pairs; p++) { /* vector */
+            system->matrix[p] += m0 * both[p] + m1 * mixed[p] + m2 * slopes[p];
+        }
     }
 }
 
 /* Assemble the Newton system of the modes alone: a slope stands alone at its point and is eliminated there. */
-static void reduce(const Grid *grid, const Real *w, const Points *at, Reduced *system) {
+static void reduce(const Grid *restrict grid, const Real *restrict w, const Points *restrict at,
+                   Reduced *restrict system) {
     const Stress *law = &at->law;
     Weights on;
     Real give[MOST_POINTS], reach[MOST_POINTS], kww[MOST_POINTS];
     int64_t n = grid->table->points;
-    for (int64_t i = 0; i < n; i++) {
+    for (int64_t i = 0; i < n; i++) { /* vector */
         Real along = at->along[i], down = at->down[i], around = at->around[i];
         Real t1 = law->t1[i], t2 = law->t2[i];
         Real once = grid->once[i], twice = grid->twice[i];
@@ -298,7 +301,7 @@ static void substitute(int64_t n, const Real *matrix, Real *x) {
 static void slopes(const Grid *grid, const Reduced *system, const Real *dc, Real lam, int gradient, Real *dw) {
     Real de[MOST_POINTS], dq[MOST_POINTS];
     strain(grid, dc, de, dq);
-    for (int64_t i = 0; i < grid->table->points; i++) {
+    for (int64_t i = 0; i < grid->table->points; i++) { /* vector */
         Real rest = lam / grid->radius[i] - (gradient ? system->gw[i] : of(0.0));
         dw[i] = (rest - dq[i] * system->kqw[i] - de[i] * system->kew[i]) * system->hw[i];
     }
@@ -352,9 +355,11 @@ static void guess(Problem *problem, const Grid *grid, State *state) {
     Real power = 1.0 - 2.0 * part + part * law.h11[0] / law.t1[0];
     power = pick((law.t1[0] > 0.0) & (power > 0.5), power, of(1.0));
     for (int64_t k = 0; k < grid->table->modes; k++) state->c[k] = of(0.0);
-    for (int64_t i = 0; i < n; i++) state->w[i] = exp_of(0.5 * problem->span * (1.0 - grid->table->xi[i]) / power);
+    for (int64_t i = 0; i < n; i++) { /* vector */
+        state->w[i] = exp_of(0.5 * problem->span * (1.0 - grid->table->xi[i]) / power);
+    }
     Real scale = problem->height / dot(n, grid->once, state->w);
-    for (int64_t i = 0; i < n; i++) state->w[i] *= scale;
+    for (int64_t i = 0; i < n; i++) state->w[i] *= scale; /* vector */
 }
 
 #endif

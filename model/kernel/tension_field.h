@@ -1,6 +1,6 @@
 /* Wrinkled films: model/membrane/tension_field.py and wrinkled_cone.py for one state, from a state of the plain
    equations on. The film is cut where its hoop tension vanishes; a wrinkled element is a straight cone, the others
-   (panels) are as in ritz.h. Whatever does not settle with the zones that it began with is left to others. */
+   (panels) are as in ritz.h. Whatever does not settle is left to others. */
 #ifndef DEA_TENSION_FIELD_H
 #define DEA_TENSION_FIELD_H
 
@@ -11,6 +11,7 @@ enum {
     MOST_UNKNOWNS = MOST_ELEMENTS * MOST_CUT_MODES + MOST_ELEMENTS - 1,
     CUT_STEPS = 15,
     WIDTH_STEPS = 8,
+    ROUNDS = 4,
 };
 #define CUT_LEVEL_FACTOR 2.0
 #define SOFT_BEFORE_FACTOR 0.2
@@ -18,6 +19,12 @@ enum {
 #define CURVED 2.0
 #define NEAR 1e-2
 #define SLACK_GOALS 5.0 /* times Newton's goal: share of the largest tension that may have a wrong sign */
+
+/* Elements between breaks from disk to ring, and which are wrinkled. */
+typedef struct {
+    int64_t elements, folded[MOST_ELEMENTS];
+    double breaks[MOST_ELEMENTS + 1];
+} Zones;
 
 /* A film cut in elements. The unknowns are the modes of its elements, one after the other, then the strains e at the
    cuts; each element has them as coefficients of its modes and of its two hats. */
@@ -420,26 +427,52 @@ static Iterate settle(Problem *problem, Cut *cut, double aim) {
     return found;
 }
 
-/* A film of one element cut where its hoop tension changes sign: `zones`, `_cut` and `remap`. Returns whether there is
-   a wrinkled zone, and not too many. */
-static int begin_zones(const Grid *grid, const Points *at, Cut *cut) {
-    double fine[FINE], span = -grid->left;
-    refined(grid->table, at->law.t2, fine);
-    cut->breaks[0] = grid->left;
-    cut->elements = 1;
-    cut->folded[0] = fine[0] < 0.0;
-    for (int64_t i = 0; i + 1 < FINE; i++) {
-        if ((fine[i] < 0.0) == (fine[i + 1] < 0.0)) continue;
-        if (cut->elements == MOST_ELEMENTS) return 0;
-        double part = smaller(larger(fine[i] / (fine[i] - fine[i + 1]), 0.05), 0.95);
-        double low = grid->left + 0.5 * (1.0 + grid->table->fine_xi[i]) * span;
-        double high = grid->left + 0.5 * (1.0 + grid->table->fine_xi[i + 1]) * span;
-        cut->breaks[cut->elements] = low + part * (high - low);
-        cut->folded[cut->elements] = !cut->folded[cut->elements - 1];
-        cut->elements++;
+/* Hoop tension at the FINE points of every element, and where wrinkled the slack in the width; returns the largest. */
+static double tensions(const Cut *cut, const Points *at, double (*fine)[FINE]) {
+    double values[MOST_POINTS], most = 0.0;
+    int64_t n = points_of(cut);
+    for (int64_t k = 0; k < cut->elements; k++) {
+        for (int64_t i = 0; i < n; i++) values[i] = cut->folded[k] ? at[k].hoop[i] - at[k].log[n + i] : at[k].law.t2[i];
+        refined(cut->grid[k].table, values, fine[k]);
+        for (int64_t i = 0; i < FINE; i++) most = larger(most, fabs(fine[k][i]));
     }
-    cut->breaks[cut->elements] = 0.0;
-    return cut->elements > 1 || cut->folded[0];
+    return most;
+}
+
+/* Share of the largest tension that may have a wrong sign: `wrong_sign`. */
+static double wrong_sign(double tolerance) { return SLACK_GOALS * goal(larger(tolerance, 1e-8)); }
+
+/* Zones of the film `old`, where its hoop tension changes sign: `zones`, `_cut`. A sign against an element's own kind
+   counts only beyond `bound`. Returns whether there is a wrinkled zone, and not too many. */
+static int find_zones(const Cut *old, double (*fine)[FINE], double bound, Zones *out) {
+    const double *place = old->grid[0].table->fine_xi;
+    double before = 0.0, before_x = 0.0;
+    out->elements = 1;
+    out->breaks[0] = old->breaks[0];
+    for (int64_t k = 0; k < old->elements; k++)
+        for (int64_t i = 0; i < FINE; i++) {
+            double value = fine[k][i], length = old->breaks[k + 1] - old->breaks[k];
+            double x = old->breaks[k] + 0.5 * (1.0 + place[i]) * length;
+            int64_t folded = old->folded[k] ? value < bound : value < -bound;
+            if (k == 0 && i == 0) out->folded[0] = folded;
+            if (folded != out->folded[out->elements - 1]) {
+                if (out->elements == MOST_ELEMENTS) return 0;
+                double part = smaller(larger(before / (before - value), 0.05), 0.95);
+                if (!(fabs(before / (before - value)) < INFINITY)) part = 0.5;
+                out->breaks[out->elements] = before_x + part * (x - before_x);
+                out->folded[out->elements++] = folded;
+            }
+            before = value;
+            before_x = x;
+        }
+    out->breaks[out->elements] = 0.0;
+    return out->elements > 1 || out->folded[0];
+}
+
+static void cut_at(const Zones *zones, Cut *cut) {
+    cut->elements = zones->elements;
+    memcpy(cut->folded, zones->folded, sizeof cut->folded);
+    memcpy(cut->breaks, zones->breaks, sizeof cut->breaks);
 }
 
 /* Value at x of the polynomial through the points of an element. */
@@ -453,27 +486,39 @@ static double carried_to(const Grid *grid, const double *values, double x) {
     return value;
 }
 
-/* The state of one element carried to those of `cut`. */
-static void remap(const Grid *from, const State *state, const Points *at, const Table *table, Cut *cut) {
-    int64_t n = table->points, modes = table->modes;
-    double rise[MOST_POINTS], slope[MOST_POINTS], least = state->w[0];
-    for (int64_t i = 0; i < from->table->points; i++) {
-        least = smaller(least, state->w[i]);
-        rise[i] = at->q[i] - at->e[i]; /* de/dx */
-    }
+/* The element of a film that has x. */
+static int64_t element_at(const Cut *cut, double x) {
+    int64_t element = 0;
+    for (int64_t k = 1; k < cut->elements; k++) element += x > cut->breaks[k];
+    return element;
+}
+
+/* The state of `old`, whose points are `at`, carried to the elements of `cut`. */
+static void remap(const Cut *old, const Points *at, const Table *table, Cut *cut) {
+    int64_t n = table->points, modes = table->modes, from = points_of(old);
+    double rise[MOST_ELEMENTS][MOST_POINTS], slope[MOST_POINTS], least = INFINITY;
+    for (int64_t k = 0; k < old->elements; k++)
+        for (int64_t i = 0; i < from; i++) {
+            least = smaller(least, old->state[k].w[i]);
+            rise[k][i] = at[k].q[i] - at[k].e[i]; /* de/dx */
+        }
     lay_elements(cut, table);
     for (int64_t k = 0; k < cut->elements; k++) {
         State *new = &cut->state[k];
         double half = 1.0 / cut->grid[k].dxi;
         for (int64_t i = 0; i < n; i++) {
             double x = half * (table->xi[i] + 1.0) + cut->breaks[k];
-            slope[i] = carried_to(from, rise, x) * half;
-            new->w[i] = larger(carried_to(from, state->w, x), least);
-            cut->natural[k][i] = carried_to(from, at->log + from->table->points, x);
+            int64_t of = element_at(old, x);
+            slope[i] = carried_to(&old->grid[of], rise[of], x) * half;
+            new->w[i] = larger(carried_to(&old->grid[of], old->state[of].w, x), least);
+            cut->natural[k][i] = carried_to(&old->grid[of], at[of].log + from, x);
         }
         for (int64_t i = 0; i < modes; i++) new->c[i] = dot(n, table->to_modes + i * n, slope);
-        new->c[modes] = k > 0 ? carried_to(from, at->e, cut->breaks[k]) : 0.0;
-        new->c[modes + 1] = k + 1 < cut->elements ? carried_to(from, at->e, cut->breaks[k + 1]) : 0.0;
+        for (int64_t end = 0; end < 2; end++) {
+            double x = cut->breaks[k + end];
+            int64_t of = element_at(old, x), inside = k + end > 0 && k + end < cut->elements;
+            new->c[modes + end] = inside ? carried_to(&old->grid[of], at[of].e, x) : 0.0;
+        }
     }
 }
 
@@ -492,31 +537,19 @@ static void prolong_cut(Cut *cut, const Table *to) {
     lay_elements(cut, to);
 }
 
-/* Whether the zones of a state are those that it was solved with, and every cut still separates two elements. */
-static int same_zones(const Cut *cut, const Points *at, double tolerance) {
-    double fine[MOST_ELEMENTS][FINE], values[MOST_POINTS], most = 0.0;
-    int64_t n = points_of(cut);
-    for (int64_t k = 0; k < cut->elements; k++) {
-        for (int64_t i = 0; i < n; i++) values[i] = cut->folded[k] ? at[k].hoop[i] - at[k].log[n + i] : at[k].law.t2[i];
-        refined(cut->grid[k].table, values, fine[k]);
-        for (int64_t i = 0; i < FINE; i++) most = larger(most, fabs(fine[k][i]));
-        if (!(cut->breaks[k + 1] - cut->breaks[k] > -1e-9 * cut->breaks[0])) return 0;
-    }
-    double bound = SLACK_GOALS * goal(larger(tolerance, 1e-8)) * most;
+/* Whether every cut still separates two elements. */
+static int admissible(const Cut *cut) {
     for (int64_t k = 0; k < cut->elements; k++)
-        for (int64_t i = 0; i < FINE; i++)
-            if (!(cut->folded[k] ? fine[k][i] < bound : fine[k][i] >= -bound)) return 0;
+        if (!(cut->breaks[k + 1] - cut->breaks[k] > -1e-9 * cut->breaks[0])) return 0;
     return 1;
 }
 
-/* From a plain state of one element, whose points are `at`, to the wrinkled one at `tolerance`. `first_modes`: to begin
-   with, by the length of the longest element. Returns WRINKLED, with the points in `out`. */
-static int fold(Problem *problem, const Table *const *tables, const int64_t *first_modes, double tolerance,
-                const Grid *grid, const State *state, const Points *at, Cut *cut, Points *out, Iterate *found,
-                double *error) {
+/* The film with the elements of `cut`, from the state `old` with the points `at`, to `tolerance`. `first_modes`: to
+   begin with, by the length of the longest element. Returns WRINKLED, with the points in `at`. */
+static int refine_cut(Problem *problem, const Table *const *tables, const int64_t *first_modes, double tolerance,
+                      const Cut *old, Cut *cut, Points *at, Iterate *found, double *error) {
     double longest = 0.0, previous = NAN, before = INFINITY, aim = goal(tolerance);
     int64_t steps = found->steps, panels = 0;
-    if (!begin_zones(grid, at, cut)) return LEFT_TO_OTHERS;
     for (int64_t k = 0; k < cut->elements; k++) {
         longest = larger(longest, cut->breaks[k + 1] - cut->breaks[k]);
         panels += !cut->folded[k];
@@ -527,7 +560,7 @@ static int fold(Problem *problem, const Table *const *tables, const int64_t *fir
         if (modes > MOST_CUT_MODES) return LEFT_TO_OTHERS;
         if (!tables[modes]) return NEEDS_TABLE;
         if (!(fabs(previous) < INFINITY))
-            remap(grid, state, at, tables[modes], cut);
+            remap(old, at, tables[modes], cut);
         else
             prolong_cut(cut, tables[modes]);
         *found = settle(problem, cut, aim);
@@ -544,8 +577,37 @@ static int fold(Problem *problem, const Table *const *tables, const int64_t *fir
         modes = tables[modes]->next;
     }
     for (int64_t k = 0; k < cut->elements; k++)
-        evaluate(problem, &cut->grid[k], &cut->state[k], cut->folded[k] ? cut->natural[k] : NULL, &out[k]);
-    return same_zones(cut, out, tolerance) ? WRINKLED : LEFT_TO_OTHERS;
+        evaluate(problem, &cut->grid[k], &cut->state[k], cut->folded[k] ? cut->natural[k] : NULL, &at[k]);
+    return WRINKLED;
+}
+
+/* From a plain state of one element, whose points are `at`, to the wrinkled one at `tolerance`; other zones than before
+   once more. Returns WRINKLED, with the points in `at`. */
+static int fold(Problem *problem, const Table *const *tables, const int64_t *first_modes, double tolerance,
+                const Grid *grid, const State *state, Points *at, Cut *cut, Iterate *found, double *error) {
+    Cut old;
+    Zones zones, now;
+    double fine[MOST_ELEMENTS][FINE];
+    old.elements = 1;
+    old.folded[0] = 0;
+    old.breaks[0] = grid->left;
+    old.breaks[1] = 0.0;
+    old.grid[0] = *grid;
+    old.state[0] = *state;
+    tensions(&old, at, fine);
+    int good = find_zones(&old, fine, 0.0, &zones);
+    for (int64_t round = 0; round < ROUNDS && good; round++) {
+        cut_at(&zones, cut);
+        int status = refine_cut(problem, tables, first_modes, tolerance, &old, cut, at, found, error);
+        if (status != WRINKLED) return status;
+        double bound = tensions(cut, at, fine) * wrong_sign(tolerance);
+        good = find_zones(cut, fine, bound, &now);
+        if (good && now.elements == zones.elements && now.folded[0] == zones.folded[0] && admissible(cut))
+            return WRINKLED;
+        old = *cut;
+        zones = now;
+    }
+    return LEFT_TO_OTHERS;
 }
 
 /* Derivatives of the force of a wrinkled film, every element with its modes. */
