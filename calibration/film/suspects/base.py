@@ -111,12 +111,12 @@ class Context:
 
     def from_energy(self, density: Density) -> Array:
         """Change of the force at the nodes (N) by an addition to the energy density of the film."""
-        l1, l2, fields, weights = self._states
+        l1, l2, fields, weights = self.states
         found: Array = np.einsum("rnp,rp->rn", density(l1, l2, fields), weights)
-        return np.asarray(np.einsum("rij,rj->ri", self._differentiation, found))
+        return np.asarray(np.einsum("rij,rj->ri", self.differentiation, found))
 
     @cached_property
-    def _states(self) -> tuple[Array, Array, Array, Array]:
+    def states(self) -> tuple[Array, Array, Array, Array]:
         """Stretches (rows, nodes, points), field V/T (rows, 1, 1), and weights (m3) of the points (rows, points)."""
         rows, nodes = self.nodes.shape
         specimens = np.empty((rows, 1), dtype=np.object_)
@@ -140,7 +140,7 @@ class Context:
         return l1, l2, (self.voltage / thickness)[:, None, None], weights * (thickness / prestretch**2)[:, None]
 
     @cached_property
-    def _differentiation(self) -> Array:
+    def differentiation(self) -> Array:
         """Matrices that differentiate the interpolants by displacement at their nodes, (rows, nodes, nodes)."""
         count = self.nodes.shape[1]
         weight = (-1.0) ** np.arange(count) * np.sin((2 * np.arange(count) + 1) * np.pi / (2 * count))

@@ -5,73 +5,119 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.film.reduction import interpolation_matrix
 from calibration.film.suspects.base import Context, Kind, Shape
-from model.material.law import stack
-
-Array = NDArray[np.float64]
+from model.arrays import Array
+from model.material.law import Law, stack
 
 RELAXATION_S = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-INSTANTS = 2000  # of a run's time, at which a viscous force is worked out
+INSTANTS = 600  # of a run's time, at which a viscous force is worked out
+EVERY = 4  # of the points along the radius one is used
 NAME = "viscous film"
+Path = tuple[Array, Array, Array]  # times (n,); log stretches and their slopes by displacement, (n, 2, points)
 
 
 def _viscous(context: Context) -> Sequence[Shape]:
     """What a Maxwell branch as stiff as the film itself adds, by its relaxation time.
 
-    The force of one is ``integral of exp(-(t - s)/tau) dD`` over the history of its run. ``D`` is the force that it
-    adds to a move that leaves it no time: it rested in the pre-stretched film, so its energy is that of the stretches
-    over the pre-stretch (`model.membrane.history`).
+    To first order the film goes the way of the elastic one, and at every point of it the branch's stretches ``x``
+    follow those of the film, ``dx/dt = du/dt - N(x)/tau`` (`model.membrane.history`; ``N`` is `_flow`). Its force is
+    the virtual work of its stress: ``integral of S(x) . du/dh``.
     """
     if not context.timed:
         return []
-    rest = _instant(context)
-    sums: list[dict[int, Array]] = [{} for _ in RELAXATION_S]
-    for run, (begin, duration) in context.runs.items():
-        mine = [k for k, row in enumerate(context.block_rows) if context.curves[row].run == run]
-        times, elastic = [], []
-        for k in mine:
-            row, block = context.block_rows[k], context.blocks[k]
-            time = context.curves[row].time
-            assert time is not None
-            times.append(time[block.rows])
-            elastic.append(context.interpolated(rest, row, block))
-        time_all, force = np.concatenate(times), np.concatenate(elastic)
-        order = np.argsort(time_all, kind="stable")
-        grid = np.linspace(begin, begin + duration, INSTANTS)
-        extra = _maxwell(grid[1] - grid[0], np.interp(grid, time_all[order], force[order]))
-        for by_block, one in zip(sums, extra, strict=True):
-            by_block.update({k: np.interp(at, grid, one) for k, at in zip(mine, times, strict=True)})
-    found = []
-    for tau, by_block in zip(RELAXATION_S, sums, strict=True):
-        places = {id(block): k for k, block in enumerate(context.blocks)}
-        rows = context.at_samples(lambda _row, block, by=by_block, at=places: by[at[id(block)]])  # type: ignore[misc]
-        found.append(Shape(f"{NAME} with a relaxation time near {tau:g} s", rows))
-    return found
-
-
-def _instant(context: Context) -> Array:
-    """Force at the nodes that a branch as stiff as the film adds to a quick move from rest (N)."""
     film = context.film
     law = film.law(np.array(film.mu)[:, None], np.array(film.alpha).reshape(-1, 1))
-    rest = np.log([curve.specimen.prestretch for curve in context.curves])[:, None, None]
+    found: list[list[Array]] = [[] for _ in RELAXATION_S]
+    forces = {run: _forces(context, run, law) for run in context.runs}
+    for k, row in enumerate(context.block_rows):
+        curve = context.curves[row]
+        assert curve.time is not None
+        times, by_time = forces[curve.run]
+        for rows, force in zip(found, by_time.T, strict=True):
+            rows.append(np.interp(curve.time[context.blocks[k].rows], times, force))
+    places = {id(block): k for k, block in enumerate(context.blocks)}
+    return [
+        Shape(
+            f"{NAME} with a relaxation time near {tau:g} s",
+            context.at_samples(lambda _row, block, of=rows: of[places[id(block)]]),  # type: ignore[misc]
+        )
+        for tau, rows in zip(RELAXATION_S, found, strict=True)
+    ]
 
-    def energy(l1: Array, l2: Array, field: Array) -> Array:
-        return law.energy(stack(np.log(l1) - rest, np.log(l2) - rest))
 
-    return context.from_energy(energy)
+def _forces(context: Context, run: str, law: Law) -> tuple[Array, Array]:
+    """Instants (n,) of a run and the forces of the branches there, (n, relaxation times)."""
+    rows = [row for row in context.block_rows if context.curves[row].run == run]
+    times, log, slope = _path(context, run)
+    _, _, _, weights = context.states
+    # Simpson's rule over fewer points: its weights of all of them alternate between 4 and 2, and begin with 1.
+    share = np.full(weights.shape[1], 2.0)
+    share[1::2], share[0], share[-1] = 4.0, 1.0, 1.0
+    fewer = EVERY * (weights[rows[0]] / share)[::EVERY]
+    fewer[1::2], fewer[2:-1:2] = 4.0 * fewer[1::2], 2.0 * fewer[2:-1:2]
+    virtual = fewer * slope
+    modulus = float(law.shear_modulus(law.mu[:, 0].tolist(), law.alpha[:, 0].tolist()))
+    tau = np.array(RELAXATION_S)[:, None]
+    x = np.zeros((2, tau.size, log.shape[2])) + (log[0] - _rest(context, rows[0]))[:, None]
+    out = np.empty((times.size, tau.size))
+    stress = _stress(law, x)
+    for k in range(times.size):
+        if k:
+            step = (times[k] - times[k - 1]) / tau
+            decay, share_left = np.exp(-step), -np.expm1(-step) / step
+            more = _flow(stress, modulus) - x  # what a finite strain adds to the flow
+            base, move = decay * x, share_left * (log[k] - log[k - 1])[:, None]
+            x = base + move - share_left * step * more
+            more = 0.5 * (more + _flow(_stress(law, x), modulus) - x)
+            x = base + move - share_left * step * more
+            stress = _stress(law, x)
+        out[k] = np.einsum("itp,ip->t", stress, virtual[k])
+    return times, out
 
 
-def _maxwell(step: float, elastic: Array) -> Array:
-    """Forces of the Maxwell branches at equal steps of time (s), from rest; shape (relaxation times, instants)."""
-    ratio = step / np.array(RELAXATION_S)
-    decay = np.exp(-ratio)
-    share = -np.expm1(-ratio) / ratio  # of a change spread over the step, what is left at its end
-    force = np.zeros((elastic.size, ratio.size))
-    for k, change in enumerate(np.diff(elastic), start=1):
-        force[k] = decay * force[k - 1] + share * change
-    return force.T
+def _path(context: Context, run: str) -> Path:
+    """How the elastic film goes through a run: at `INSTANTS` of its time, and at the ends of its blocks."""
+    l1, l2, _, _ = context.states
+    log = np.log(np.stack((l1, l2), axis=2)[..., ::EVERY])  # (rows, nodes, 2, points)
+    slope = np.einsum("rij,rjdp->ridp", context.differentiation, log)
+    begin, duration = context.runs[run]
+    grid = np.linspace(begin, begin + duration, INSTANTS)
+    parts: list[Path] = []
+    for block, row in zip(context.blocks, context.block_rows, strict=True):
+        curve = context.curves[row]
+        if curve.run != run:
+            continue
+        assert curve.time is not None
+        time = curve.time[block.rows]
+        order = np.argsort(time, kind="stable")
+        first, last = time[order[[0, -1]]]
+        inside = grid[(grid > first) & (grid < last)]
+        at = np.unique(np.concatenate(([first], inside, [last])))
+        matrix = interpolation_matrix(context.nodes[row], np.interp(at, time[order], curve.place[block.rows][order]))
+        parts.append((at, np.einsum("nj,jdp->ndp", matrix, log[row]), np.einsum("nj,jdp->ndp", matrix, slope[row])))
+    times, logs, slopes = (np.concatenate(one) for one in zip(*parts, strict=True))
+    order = np.argsort(times, kind="stable")
+    order = order[np.concatenate(([True], np.diff(times[order]) > 0.0))]
+    return times[order], logs[order], slopes[order]
+
+
+def _rest(context: Context, row: int) -> float:
+    """Logarithm of the stretch in which the branches rest."""
+    return float(np.log(context.curves[row].specimen.prestretch))
+
+
+def _stress(law: Law, x: Array) -> Array:
+    """``dW/dL`` at log stretches (2, ..., points), in Pa."""
+    shape = x.shape
+    return np.array(law.derivatives(stack(x[0].ravel(), x[1].ravel()))[:2]).reshape(shape)
+
+
+def _flow(stress: Array, modulus: float) -> Array:
+    """``N``: the flow over ``1/tau``, ``(S_i - (S_1 + S_2)/3) / 2G``; at small strain the log stretch itself."""
+    found: Array = (stress - stress.sum(axis=0) / 3.0) / (2.0 * modulus)
+    return found
 
 
 REMEDY = "hold the film displaced, in the same run, for several times as long"

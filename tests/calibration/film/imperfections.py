@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,10 @@ import numpy as np
 from calibration.film.identify import identify
 from calibration.film.result import Identification
 from model.material.neo_hooke import NeoHooke
-from tests.calibration.film.independent import ONE_TERM, Sweep, measured, secant_modulus
+from tests.calibration.film.independent import HIGHEST_M, ONE_TERM, Sweep, measured, secant_modulus, sweeps
 from tests.calibration.film.shooting import Array, Cone
 from tests.calibration.film.table_road import through_table
+from tests.calibration.film.viscous_cone import ViscousCone
 
 # What a careful laboratory states, and the gain of the force that tables of other rigs are read with.
 STATED = dict.fromkeys(("prestretch_uncertainty", "disk_radius_uncertainty", "force_gain"), 0.005)
@@ -51,24 +52,22 @@ def film_of(field: str) -> Callable[[float], dict[str, Any]]:
 
 
 def viscous(tau: float) -> Callable[[float], dict[str, Any]]:
-    """A Maxwell branch as stiff as ``size`` times the film at 0 V, worked out step by step through the run."""
-    elastic = Cone(**ONE_TERM).curves((0.0,), 12e-3)[0]
+    """A Maxwell branch as stiff as ``size`` times the film: what it adds to the force through the whole run."""
+    return lambda size: {"distortion": lambda sweep, force: force + _added(tau, size)(sweep.time)}
 
-    def make(size: float) -> dict[str, Any]:
-        last = {"t": 0.0, "branch": 0.0, "elastic": 0.0}
 
-        def distortion(sweep: Sweep, force: Array) -> Array:
-            rest, extra = elastic(sweep.h), np.zeros(force.size)
-            for k in range(force.size):
-                last["branch"] = (
-                    last["branch"] * math.exp(-(sweep.time[k] - last["t"]) / tau) + rest[k] - last["elastic"]
-                )
-                last["t"], last["elastic"], extra[k] = sweep.time[k], rest[k], last["branch"]
-            return force + size * extra
-
-        return {"distortion": distortion}
-
-    return make
+@lru_cache(maxsize=8)
+def _added(tau: float, size: float) -> Callable[[Array], Array]:
+    """By the time of the run, from finite elements of a film at the protocol's voltages."""
+    t, h, volts = [], [], []
+    for sweep in sweeps(3):  # its ends and its top
+        t += [sweep.time[0], sweep.time.mean(), sweep.time[-1]]
+        h += [sweep.h[0], HIGHEST_M, sweep.h[-1]]
+        volts += 3 * [sweep.voltage]
+    film = ViscousCone(branches=((size, tau),), **ONE_TERM)
+    trace = film.history(t, h, volts)
+    added = trace.force - replace(film, branches=()).forces(trace.t, trace.h, trace.voltage)
+    return lambda time: np.interp(time, trace.t, added)
 
 
 def reading(change: Callable[[Array, float], Array]) -> Callable[[float], dict[str, Any]]:

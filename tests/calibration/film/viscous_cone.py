@@ -73,9 +73,10 @@ class ViscousCone:
         """Force along a piecewise linear history from rest, with ``moves`` steps in the shortest kind of stretch."""
         at = self.times(t, moves)
         heights, volts = np.interp(at, t, h), np.interp(at, t, voltage)
-        return Trace(at, heights, volts, self._march(at, heights, volts))
+        return Trace(at, heights, volts, self.forces(at, heights, volts))
 
-    def _march(self, at: Array, heights: Array, volts: Array) -> Array:
+    def forces(self, at: Array, heights: Array, volts: Array) -> Array:
+        """Force at the end of every step from one of the times ``at`` to the next, from rest at the first."""
         n = self.elements
         radius = np.exp(np.linspace(math.log(self.a), math.log(self.b), n + 1))
         width, middle = np.diff(radius), 0.5 * (radius[1:] + radius[:-1])

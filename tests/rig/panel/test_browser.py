@@ -20,6 +20,7 @@ from rig.benchmark.stand import Stand
 from rig.log.reader import read_log
 from rig.protocol.experiment import SERVED_BY, SERVER
 from rig.sim.settings import Fault
+from tests.rig.panel.ten_hours import ten_hours
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs the dependency group browser")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -106,7 +107,7 @@ def process(said: Path, *arguments: str | Path) -> subprocess.Popen[bytes]:
 
 def panel_of(log: Path, said: Path) -> tuple[subprocess.Popen[bytes], str]:
     """A panel's process and its address."""
-    panel, end = process(said, "watch", log, "--no-browser"), time.monotonic() + 30.0
+    panel, end = process(said, "watch", log, "--no-browser"), time.monotonic() + 120.0
     while not (found := re.search(r"http://\S+", said.read_text())):
         assert time.monotonic() < end and panel.poll() is None, said.read_text()
         time.sleep(0.05)
@@ -217,3 +218,39 @@ def test_it_fits_a_desk_and_a_phone(browser: Any, tmp_path: Path, width: int, he
         page.close()
         panel.terminate()
         panel.wait(10)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_ten_hours_do_not_grow_the_browsers_memory(browser: Any, tmp_path: Path) -> None:
+    """Objects that are left when garbage is collected, and nodes of the page, from 1 to 10 hours of a log.
+
+    The page is opened at half an hour: what it makes with the first new data is there at one.
+    """
+    log = tmp_path / "long.mcap"
+    panel: subprocess.Popen[bytes] | None = None
+    page = browser.new_page()
+    held: list[tuple[float, float]] = []
+    try:
+        for t in ten_hours(log):
+            if panel is None:
+                panel, address = panel_of(log, tmp_path / "panel.txt")
+                page.goto(address)
+                asked = page.context.new_cdp_session(page)
+                asked.send("Performance.enable")
+            end = time.monotonic() + 120.0
+            while float(page.evaluate("last ? last.t_s : 0")) < t - 2.0:
+                assert time.monotonic() < end
+                page.wait_for_timeout(200)
+            page.wait_for_timeout(3000)
+            asked.send("HeapProfiler.collectGarbage")
+            found = {one["name"]: one["value"] for one in asked.send("Performance.getMetrics")["metrics"]}
+            held.append((found["JSHeapUsedSize"] / 2**20, found["Nodes"]))
+    finally:
+        page.close()
+        if panel is not None:
+            panel.terminate()
+            panel.wait(20)
+    print("heap (MiB) and nodes after 0.5, 1, 4, 7 and 10 h:", held)
+    assert held[-1][0] <= 1.1 * held[1][0]
+    assert held[-1][1] <= 1.1 * held[1][1]
