@@ -5,7 +5,6 @@
    solved by itself with memory of its own on the stack, so that nothing depends on the others. */
 #include "from_rest.h"
 #include "several.h"
-#include "tension_field.h"
 
 #ifdef _WIN32
 #define EXPORT __declspec(dllexport)
@@ -252,20 +251,23 @@ static int64_t completed(const Task *task, const Film *film, double h, double vo
     Problem problem = problem_of(&one->posed);
     problem.mechanical = one->mechanical;
     problem.electric = one->electric;
+    problem.relaxed = one->relaxed;
     out->iterations = one->steps;
     out->error_estimate = one->error;
-    if (one->status == SLACK || one->status == NEEDS_TABLE) return one->status;
-    if (one->status == TAUT) {
+    if (one->status == SLACK || one->status == NEEDS_TABLE || one->status == LEFT_TO_OTHERS) return one->status;
+    if (one->status == TAUT || one->status == WRINKLED) {
+        int relaxed = one->status == WRINKLED;
         memcpy(&x, one->extremes, sizeof x);
-        if (!is_doubtful(&x) && !(task->relaxed && is_folded(&x))) {
-            int wrinkled = x.hoop < ROUND_OFF_TENSION * x.meridional;
+        if (relaxed && is_doubtful(&x)) return LEFT_TO_OTHERS; /* soft ones are followed, all */
+        if (relaxed || (!is_doubtful(&x) && !(task->relaxed && is_folded(&x)))) {
+            int wrinkled = relaxed || x.hoop < ROUND_OFF_TENSION * x.meridional;
             int64_t placed = place_all(film, &problem, h, voltage, &x, &found, one->modes, wrinkled, out);
             memcpy(&d, one->derivatives, sizeof d);
             if (task->sensitivities) place_slopes(film, h, voltage, &d, out);
             return placed;
         }
     }
-    lay(&grid, task->tables[one->modes], one->modes, -problem.span, 0.0);
+    lay(&grid, task->tables[one->plain_modes], one->plain_modes, -problem.span, 0.0);
     memcpy(state.c, one->c, sizeof state.c);
     memcpy(state.w, one->w, sizeof state.w);
     return continued(task, film, &problem, h, voltage, (int)one->slack, one->status, &found, &grid, &state, out, NULL);

@@ -159,18 +159,19 @@ static Real peak(const Table *table, const Real *values, Bracket *place) {
     return value + step * (slope + 0.5 * curve * step); /* the last step is so short that its cube is nothing */
 }
 
-/* Largest value over the film, from those at the points of every element and at both edges, and R/b where it stands.
-   A film of more than one element has a lane of its own. */
+/* Largest value over the film, from those at the points of every element and at both edges, and R/b where it stands. */
 static Real largest(const Solved *solved, const Real (*values)[MOST_POINTS], Real disk, Real ring, Real *radius) {
     const Table *table = solved->grid[0].table;
     Real best = larger(disk, ring), inside = of(-INFINITY), most = of(-INFINITY), fine[FINE];
+    Real chosen[MOST_POINTS], left = of(0.0), right = of(0.0);
     Bracket place = {of(0.0), of(0.0), of(0.0)};
-    int64_t element = 0;
+    for (int64_t i = 0; i < table->points; i++) chosen[i] = of(0.0);
     *radius = exp_of(pick(disk >= ring, solved->grid[0].left, of(0.0)));
     for (int64_t k = 0; k < solved->elements; k++)
         for (int64_t i = 0; i < table->points; i++) inside = larger(inside, values[k][i]);
     if (!any(inside > best)) return best;
     for (int64_t k = 0; k < solved->elements; k++) {
+        Mask won = is_not(yes());
         refined(table, values[k], fine);
         for (int64_t i = 0; i < FINE; i++) {
             Mask higher = fine[i] > most;
@@ -178,13 +179,17 @@ static Real largest(const Solved *solved, const Real (*values)[MOST_POINTS], Rea
             place.low = pick(higher, of(table->fine_xi[i > 0 ? i - 1 : 0]), place.low);
             place.xi = pick(higher, of(table->fine_xi[i]), place.xi);
             place.high = pick(higher, of(table->fine_xi[i < FINE - 1 ? i + 1 : FINE - 1]), place.high);
-            if (any(higher)) element = k;
+            won |= higher;
         }
+        if (!any(won)) continue;
+        const Grid *grid = &solved->grid[k];
+        left = pick(won, grid->left, left);
+        right = pick(won, grid->right, right);
+        for (int64_t i = 0; i < table->points; i++) chosen[i] = pick(won, values[k][i], chosen[i]);
     }
-    Real top = peak(table, values[element], &place);
+    Real top = peak(table, chosen, &place);
     Mask there = (inside > best) & (top > best);
-    const Grid *grid = &solved->grid[element];
-    *radius = pick(there, exp_of(grid->left + 0.5 * (1.0 + place.xi) * (grid->right - grid->left)), *radius);
+    *radius = pick(there, exp_of(left + 0.5 * (1.0 + place.xi) * (right - left)), *radius);
     return pick(there, top, best);
 }
 

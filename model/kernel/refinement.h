@@ -27,7 +27,8 @@ enum {
     NEEDS_TABLE = -2,
     FOLDED = -3,
     UNSETTLED = -4,
-    OPEN = -5
+    OPEN = -5,
+    FOLDING = -6
 };
 
 /* A state after Newton at one resolution. */

@@ -1,6 +1,6 @@
-/* Taut states side by side, one in every lane: what `refine` and `extremes` do with one state after the other.
+/* States side by side, one in every lane: what `refine`, `refine_cut` and `extremes` do with one state after the other.
 
-   States that go on at the same resolution are taken together, whatever brought them there. */
+   States that go on at the same resolution, with the same zones, are taken together, whatever brought them there. */
 #ifndef LANES
 #define LANES 2
 #define SOLVE_SEVERAL solve_several_narrow
@@ -13,7 +13,7 @@ typedef struct {
     int64_t members;
     One *of[LANES];
     Problem problem;
-    Grid grid;
+    Grid grid; /* of the plain state */
     State state;
     Real previous;
 } Pack;
@@ -24,7 +24,7 @@ static Mask lanes_where(const Pack *pack, int64_t status) {
     return these;
 }
 
-static void take_up(Pack *pack, int64_t modes) {
+static void take_up(Pack *pack) {
     Problem *problem = &pack->problem;
     const FilmLaw *first = &pack->of[0]->posed.law;
     problem->law.kind = first->kind;
@@ -40,9 +40,26 @@ static void take_up(Pack *pack, int64_t modes) {
         problem->height[k] = posed->height;
         pack->previous[k] = pack->of[k]->previous;
     }
-    problem->counts = lanes_where(pack, OPEN);
+    problem->counts = lanes_where(pack, pack->of[0]->status);
     problem->mechanical = problem->electric = problem->relaxed = counted(problem->counts, 0);
-    lay(&pack->grid, pack->task->tables[modes], modes, -problem->span, of(0.0));
+}
+
+/* What the law was asked for goes to the account of every state. */
+static void count_up(const Pack *pack) {
+    for (int64_t k = 0; k < pack->members; k++) {
+        pack->of[k]->mechanical += pack->problem.mechanical[k];
+        pack->of[k]->electric += pack->problem.electric[k];
+        pack->of[k]->relaxed += pack->problem.relaxed[k];
+    }
+}
+
+static void lay_plain(Pack *pack, int64_t modes) {
+    lay(&pack->grid, pack->task->tables[modes], modes, -pack->problem.span, of(0.0));
+}
+
+/* Numbers of every lane from those of the states, and back. */
+static void into_lane(const double *from, int64_t numbers, int64_t lane, Real *all) {
+    for (int64_t i = 0; i < numbers; i++) all[i][lane] = from[i];
 }
 
 /* A first state; those that no tension can hold are told. */
@@ -56,19 +73,20 @@ static void begin(Pack *pack) {
     guess(&pack->problem, &pack->grid, &pack->state);
 }
 
-static void go_on(Pack *pack, int64_t modes) {
+static void go_on(Pack *pack) {
+    const Table *table = pack->grid.table;
     for (int64_t k = 0; k < LANES; k++) {
-        const One *one = pack->of[k];
-        for (int64_t i = 0; i < modes; i++) pack->state.c[i][k] = one->c[i];
-        for (int64_t i = 0; i < pack->grid.table->points; i++) pack->state.w[i][k] = one->w[i];
+        into_lane(pack->of[k]->c, table->modes, k, pack->state.c);
+        into_lane(pack->of[k]->w, table->points, k, pack->state.w);
     }
 }
 
 static void put_down(const Pack *pack, int64_t lane, const Table *table) {
     One *one = pack->of[lane];
-    one->modes = table->modes;
-    for (int64_t i = 0; i < table->modes; i++) one->c[i] = pack->state.c[i][lane];
-    for (int64_t i = 0; i < table->points; i++) one->w[i] = pack->state.w[i][lane];
+    one->modes = one->plain_modes = table->modes;
+    one->plain_steps = one->steps;
+    lane_of(pack->state.c, lane, table->modes, one->c);
+    lane_of(pack->state.w, lane, table->points, one->w);
 }
 
 static int64_t judged(const Task *task, const Table *table, double hoop, int64_t ok, double error) {
@@ -79,12 +97,12 @@ static int64_t judged(const Task *task, const Table *table, double hoop, int64_t
     return task->tables[table->next] ? OPEN : NEEDS_TABLE;
 }
 
-/* Numbers of one lane, from a structure of nothing but these. */
-static void lane_of(const void *all, int64_t lane, int64_t numbers, double *out) {
-    for (int64_t i = 0; i < numbers; i++) {
-        Real number;
-        memcpy(&number, (const char *)all + (size_t)i * sizeof(Real), sizeof(Real));
-        out[i] = number[lane];
+/* Keep what solved states of this status say. */
+static void keep(Pack *pack, int64_t status, const Extremes *x, const Derivatives *d) {
+    for (int64_t k = 0; k < pack->members; k++) {
+        if (pack->of[k]->status != status) continue;
+        lane_of((const Real *)x, k, EXTREMES, pack->of[k]->extremes);
+        if (pack->task->sensitivities) lane_of((const Real *)d, k, DERIVATIVES, pack->of[k]->derivatives);
     }
 }
 
@@ -99,10 +117,33 @@ static void tell(Pack *pack, Real lam) {
     Solved solved = {1, &pack->grid, &at, NULL};
     extremes(problem, &solved, lam, &x);
     if (pack->task->sensitivities) derivatives_of(problem, &pack->grid, &pack->state, &at, lam, &d);
+    keep(pack, TAUT, &x, &d);
+}
+
+/* A resolution to begin with, or why there is none. */
+static int64_t begun_at(const Task *task, int64_t modes) {
+    if (modes > MOST_CUT_MODES) return LEFT_TO_OTHERS;
+    return task->tables[modes] ? FOLDING : NEEDS_TABLE;
+}
+
+/* Where states that are wrinkled by the plain equations are to be cut. */
+static void seek_zones(Pack *pack) {
+    Points at;
+    Cut whole;
+    Real fine[MOST_ELEMENTS][FINE];
+    pack->problem.counts = lanes_where(pack, FOLDED);
+    evaluate(&pack->problem, &pack->grid, &pack->state, NULL, &at);
+    uncut(&pack->grid, &pack->state, &whole);
+    tensions(&whole, &at, fine);
     for (int64_t k = 0; k < pack->members; k++) {
-        if (pack->of[k]->status != TAUT) continue;
-        lane_of(&x, k, EXTREMES, pack->of[k]->extremes);
-        if (pack->task->sensitivities) lane_of(&d, k, DERIVATIVES, pack->of[k]->derivatives);
+        One *one = pack->of[k];
+        if (one->status != FOLDED) continue;
+        one->status = LEFT_TO_OTHERS;
+        if (!zones_now(&whole, (const Real(*)[FINE])fine, of(0.0), 0.0, k, &one->zones)) continue;
+        one->modes = modes_for(&one->zones, pack->task->first_modes);
+        one->status = begun_at(pack->task, one->modes);
+        one->previous = NAN;
+        one->before = INFINITY;
     }
 }
 
@@ -110,12 +151,13 @@ static void tell(Pack *pack, Real lam) {
 static void settle_several(Pack *pack, int64_t modes) {
     const Task *task = pack->task;
     const Table *table = task->tables[modes];
-    int64_t settled = 0, open = 0;
-    take_up(pack, modes);
+    int64_t count[3] = {0, 0, 0};
+    take_up(pack);
+    lay_plain(pack, modes);
     if (pack->of[0]->steps == 0)
         begin(pack);
     else
-        go_on(pack, modes);
+        go_on(pack);
     Iterate found = newton(&pack->problem, &pack->grid, &pack->state, goal(task->tolerance), MOST_STEPS);
     Real error = estimate(&found, pack->previous, task->tolerance, LEVEL_FACTOR);
     for (int64_t k = 0; k < pack->members; k++) {
@@ -125,16 +167,15 @@ static void settle_several(Pack *pack, int64_t modes) {
         one->lam = found.lam[k];
         one->error = error[k];
         one->status = judged(task, table, found.hoop[k], found.ok[k], error[k]);
-        settled += one->status == TAUT;
-        open += one->status == OPEN;
+        count[0] += one->status == TAUT;
+        count[1] += one->status == FOLDED;
+        count[2] += one->status == OPEN;
         if (one->status != OPEN) put_down(pack, k, table);
     }
-    if (settled) tell(pack, found.lam);
-    for (int64_t k = 0; k < pack->members; k++) {
-        pack->of[k]->mechanical += pack->problem.mechanical[k];
-        pack->of[k]->electric += pack->problem.electric[k];
-    }
-    if (!open) return;
+    if (count[0]) tell(pack, found.lam);
+    if (count[1]) seek_zones(pack);
+    count_up(pack);
+    if (!count[2]) return;
     const Table *next = task->tables[table->next];
     prolong(table, next, table->carry, &pack->state);
     for (int64_t k = 0; k < pack->members; k++) {
@@ -144,39 +185,147 @@ static void settle_several(Pack *pack, int64_t modes) {
     }
 }
 
-static int go_together(const One *one, const One *other) {
-    return one->posed.law.kind == other->posed.law.kind && one->posed.law.moduli == other->posed.law.moduli &&
-           (one->steps == 0) == (other->steps == 0);
+/* The elements of wrinkled states, from the plain state when they are new. */
+static void cut_several(Pack *pack, const Table *table, Cut *cut) {
+    const One *first = pack->of[0];
+    cut->elements = first->zones.elements;
+    memcpy(cut->folded, first->zones.folded, sizeof cut->folded);
+    for (int64_t k = 0; k < LANES; k++) into_lane(pack->of[k]->zones.breaks, cut->elements + 1, k, cut->breaks);
+    if (isnan(first->previous)) {
+        Points at;
+        Cut whole;
+        Mask every = pack->problem.counts;
+        pack->problem.counts = is_not(yes()); /* they have been counted where the zones were sought */
+        lay_plain(pack, first->plain_modes);
+        go_on(pack);
+        evaluate(&pack->problem, &pack->grid, &pack->state, NULL, &at);
+        pack->problem.counts = every;
+        uncut(&pack->grid, &pack->state, &whole);
+        remap(&whole, &at, table, cut);
+        return;
+    }
+    lay_elements(cut, table);
+    for (int64_t k = 0; k < LANES; k++)
+        for (int64_t i = 0; i < cut->elements; i++) {
+            into_lane(pack->of[k]->cut_c[i], table->modes + 2, k, cut->state[i].c);
+            into_lane(pack->of[k]->cut_w[i], table->points, k, cut->state[i].w);
+            into_lane(pack->of[k]->natural[i], table->points, k, cut->natural[i]);
+        }
 }
 
-/* Of the states that are open. */
-static int64_t fewest_modes(const One *states, int64_t count) {
+static void put_down_cut(const Cut *cut, int64_t lane, One *one) {
+    const Table *table = cut->grid[0].table;
+    one->modes = table->modes;
+    breaks_of(cut, lane, one->zones.breaks);
+    for (int64_t i = 0; i < cut->elements; i++) {
+        lane_of(cut->state[i].c, lane, table->modes + 2, one->cut_c[i]);
+        lane_of(cut->state[i].w, lane, table->points, one->cut_w[i]);
+        lane_of(cut->natural[i], lane, table->points, one->natural[i]);
+    }
+}
+
+/* What settled wrinkled states say; those with other zones than they were solved with go on alone. */
+static void tell_cut(Pack *pack, const Cut *cut, Real lam) {
+    Problem *problem = &pack->problem;
+    Points at[MOST_ELEMENTS];
+    Real fine[MOST_ELEMENTS][FINE];
+    Extremes x;
+    Derivatives d;
+    problem->counts = lanes_where(pack, WRINKLED);
+    evaluate_cut(problem, cut, at);
+    Real most = tensions(cut, at, fine);
+    for (int64_t k = 0; k < pack->members; k++) {
+        One *one = pack->of[k];
+        Zones now;
+        if (one->status != WRINKLED) continue;
+        int good = zones_now(cut, (const Real(*)[FINE])fine, most, wrong_sign(pack->task->tolerance), k, &now);
+        if (good && has_zones(cut, &now, k)) continue;
+        one->status = FOLDED;
+        one->steps = one->plain_steps;
+    }
+    Solved solved = {cut->elements, cut->grid, at, cut->folded};
+    extremes(problem, &solved, lam, &x);
+    if (pack->task->sensitivities) cut_derivatives(problem, cut, at, lam, &d);
+    keep(pack, WRINKLED, &x, &d);
+}
+
+/* Newton on wrinkled states and their cuts at one resolution, and what follows from it. */
+static void settle_folding(Pack *pack, int64_t modes) {
+    const Task *task = pack->task;
+    const Table *table = task->tables[modes];
+    int64_t solved = 0, open = 0;
+    Cut cut;
+    take_up(pack);
+    cut_several(pack, table, &cut);
+    Iterate found = settle(&pack->problem, &cut, goal(task->tolerance));
+    Real error = estimate(&found, pack->previous, task->tolerance, CUT_LEVEL_FACTOR);
+    for (int64_t k = 0; k < pack->members; k++) {
+        One *one = pack->of[k];
+        one->steps += found.steps[k];
+        one->lam = found.lam[k];
+        one->error = error[k] + of_cones(&one->zones, one->before);
+        if (fabs(one->previous) < INFINITY) one->before = fabs((one->lam - one->previous) / one->lam);
+        one->status = !found.ok[k]                    ? LEFT_TO_OTHERS
+                      : one->error <= task->tolerance ? WRINKLED
+                                                      : begun_at(task, table->next);
+        solved += one->status == WRINKLED;
+        open += one->status == FOLDING;
+    }
+    if (solved) tell_cut(pack, &cut, found.lam);
+    count_up(pack);
+    if (!open) return;
+    prolong_cut(&cut, task->tables[table->next]);
+    for (int64_t k = 0; k < pack->members; k++) {
+        if (pack->of[k]->status != FOLDING) continue;
+        pack->of[k]->previous = pack->of[k]->lam;
+        put_down_cut(&cut, k, pack->of[k]);
+    }
+}
+
+static int go_together(const One *one, const One *other) {
+    if (one->posed.law.kind != other->posed.law.kind || one->posed.law.moduli != other->posed.law.moduli) return 0;
+    if (one->status == OPEN) return (one->steps == 0) == (other->steps == 0);
+    return one->zones.elements == other->zones.elements && one->zones.folded[0] == other->zones.folded[0] &&
+           one->plain_modes == other->plain_modes && isnan(one->previous) == isnan(other->previous);
+}
+
+/* Of the states that have this status. */
+static int64_t fewest_modes(const One *states, int64_t count, int64_t status) {
     int64_t fewest = MOST_MODES + 1;
     for (int64_t s = 0; s < count; s++)
-        if (states[s].status == OPEN && states[s].modes < fewest) fewest = states[s].modes;
+        if (states[s].status == status && states[s].modes < fewest) fewest = states[s].modes;
     return fewest;
 }
 
-void SOLVE_SEVERAL(const Task *task, One *states, int64_t count) {
-    for (int64_t s = 0; s < count; s++) {
-        One *one = &states[s];
-        one->status = OPEN;
-        one->modes = modes_to_begin_with(task, one->posed.span);
-        if (!task->tables[one->modes]) one->status = NEEDS_TABLE;
-        one->steps = one->mechanical = one->electric = one->slack = 0;
-        one->previous = NAN;
-    }
-    for (int64_t modes = fewest_modes(states, count); modes <= MOST_MODES; modes = fewest_modes(states, count))
+/* Take the states of this status from resolution to resolution until none has it. */
+static void advance_all(const Task *task, One *states, int64_t count, int64_t status) {
+    int64_t modes;
+    while ((modes = fewest_modes(states, count, status)) <= MOST_MODES)
         for (int64_t first = 0; first < count; first++) {
             Pack pack;
             pack.task = task;
             pack.members = 0;
             for (int64_t s = first; s < count && pack.members < LANES; s++)
-                if (states[s].status == OPEN && states[s].modes == modes &&
+                if (states[s].status == status && states[s].modes == modes &&
                     (pack.members == 0 || go_together(pack.of[0], &states[s])))
                     pack.of[pack.members++] = &states[s];
             if (pack.members == 0) break;
             for (int64_t k = pack.members; k < LANES; k++) pack.of[k] = pack.of[0];
-            settle_several(&pack, modes);
+            if (status == OPEN)
+                settle_several(&pack, modes);
+            else
+                settle_folding(&pack, modes);
         }
+}
+
+void SOLVE_SEVERAL(const Task *task, One *states, int64_t count) {
+    for (int64_t s = 0; s < count; s++) {
+        One *one = &states[s];
+        one->modes = one->plain_modes = modes_to_begin_with(task, one->posed.span);
+        one->status = task->tables[one->modes] ? OPEN : NEEDS_TABLE;
+        one->steps = one->mechanical = one->electric = one->relaxed = one->slack = 0;
+        one->previous = NAN;
+    }
+    advance_all(task, states, count, OPEN);
+    advance_all(task, states, count, FOLDING);
 }

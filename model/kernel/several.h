@@ -1,8 +1,8 @@
-/* States of taut films side by side: what membrane.c hands to several.c. */
+/* States side by side: what membrane.c hands to several.c. */
 #ifndef DEA_SEVERAL_H
 #define DEA_SEVERAL_H
 
-#include "output.h"
+#include "tension_field.h"
 
 enum {
     EXTREMES = sizeof(Extremes) / sizeof(Real),
@@ -21,11 +21,17 @@ typedef struct {
 /* A state on its way over the resolutions. */
 typedef struct {
     Posed posed;
-    int64_t status; /* what `refine` says of it, SLACK, or OPEN */
-    int64_t slack, modes, steps, mechanical, electric;
-    double lam, previous, error;
+    int64_t status; /* OPEN, FOLDING; then what `refine` says of it, SLACK or WRINKLED */
+    int64_t slack, modes, steps, mechanical, electric, relaxed;
+    double lam, previous, before, error;
+    /* The plain state. */
+    int64_t plain_modes, plain_steps;
     double c[MOST_FUNCTIONS], w[MOST_POINTS];
-    double extremes[EXTREMES], derivatives[DERIVATIVES]; /* of a TAUT one: `Extremes` and `Derivatives` */
+    /* And the wrinkled one. */
+    Zones zones;
+    double cut_c[MOST_ELEMENTS][MOST_CUT_MODES + 2];
+    double cut_w[MOST_ELEMENTS][MOST_CUT_MODES + 3], natural[MOST_ELEMENTS][MOST_CUT_MODES + 3];
+    double extremes[EXTREMES], derivatives[DERIVATIVES]; /* `Extremes` and `Derivatives` of a solved one */
 } One;
 
 static inline int64_t modes_to_begin_with(const Task *task, double span) {

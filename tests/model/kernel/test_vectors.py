@@ -69,4 +69,5 @@ def test_states_side_by_side_are_computed_four_at_a_time(tmp_path: Path) -> None
     compiled(HERE, "several_wide.c", "-S", "-o", str(made))
     kinds = re.findall(r"\bv(?:mul|add|sub|div|sqrt)([sp])d\s.*%([xy])mm", made.read_text())
     assert kinds.count(("p", "y")) > 1000
-    assert len(kinds) - kinds.count(("p", "y")) < 0.02 * len(kinds)
+    # Zones are sought lane by lane, what a state is judged by too.
+    assert len(kinds) - kinds.count(("p", "y")) < 0.04 * len(kinds)
