@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import doctest
+import importlib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -144,3 +146,10 @@ def test_imports_inside_functions_are_on_the_list() -> None:
     }
     assert sorted(found - LATE.keys()) == []
     assert sorted(LATE.keys() - found) == [], "no longer needed on the list"
+
+
+def test_examples_in_docstrings_hold() -> None:
+    with_examples = [name for name, path in MODULES.items() if ">>> " in path.read_text(encoding="utf-8")]
+    results = {name: doctest.testmod(importlib.import_module(name)) for name in with_examples}
+    assert {name: result.failed for name, result in results.items() if result.failed} == {}
+    assert all(result.attempted for result in results.values()) and len(results) > 5

@@ -110,8 +110,8 @@ def ports(place: Place) -> Iterator[dict[str, dict[str, str]]]:
 
 
 def test_a_scene_a_run_and_a_replay_know_it(place: Place) -> None:
-    place.told("check scene.toml protocol.toml", "run scene.toml protocol.toml -o a.mcap")
-    info, verified, again = place.told("info a.mcap", "replay --verify a.mcap", "replay --rerun a.mcap")
+    made = ("check scene.toml protocol.toml", "run scene.toml protocol.toml -o a.mcap")
+    _, _, info, verified, again = place.told(*made, "info a.mcap", "replay --verify a.mcap", "replay --rerun a.mcap")
     assert "model ACME, serial 4711, firmware 1.0" in info
     assert "every sample comes out as recorded" in verified
     assert "the run ends as it did" in again

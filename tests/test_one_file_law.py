@@ -113,8 +113,8 @@ def test_a_scene_with_it_is_checked_run_and_fitted(package: Path) -> None:
     scene, log, out = package / "scene.toml", package / "run.mcap", package / "fit.json"
     scene.write_text(SCENE.replace("CERTIFICATE", str(FIXTURES / "calibrations" / "force.toml")))
     protocol = FIXTURES / "protocols" / "passive.toml"
-    dea_rig(package, ["check", scene, protocol], ["run", scene, protocol, "-o", log, "--yes"])
-    (told,) = dea_rig(package, ["fit", log, "-o", out])
+    run = ["run", scene, protocol, "-o", log, "--yes"]
+    *_, told = dea_rig(package, ["check", scene, protocol], run, ["fit", log, "-o", out])
     assert "Demiray law" in told, told
     found = json.loads(out.read_text())
     assert found["law"] == "demiray"

@@ -88,14 +88,17 @@ def test_the_step_is_checked_run_recorded_and_replayed(other_package: Path) -> N
     text = text.replace("approach_from_mm = 36.0", "approach_from_mm = 5.0")  # less way to go
     text = text.replace("seed = 7", "seed = 7\ncontact_position_mm = 7.0")
     scene.write_text(text + "\n[simulation.stage]\nstart_position_mm = 2.0\n")
-    checked, told, done = dea_rig(
-        str(other_package), ["check", scene, protocol], ["keys", "knock"], ["run", scene, protocol, "-o", log]
+    checked, told, done, replayed = dea_rig(
+        str(other_package),
+        ["check", scene, protocol],
+        ["keys", "knock"],
+        ["run", scene, protocol, "-o", log],
+        ["replay", log],
     )
     assert checked.returncode == 0, checked.stderr
     assert "knock: knock 3" in checked.stdout
     assert told.returncode == 0 and "How deep (mm). Typical: 0.5 to 1." in told.stdout, told.stderr
     assert done.returncode == 0, done.stderr
-    (replayed,) = dea_rig(str(other_package), ["replay", log])
     assert replayed.returncode == 0, replayed.all
     run = load_run(log, {})
     assert [(p.cycle, p.direction) for p in run.phases if p.kind == "knock" and p.record] == [(1, 1), (2, 1), (3, 1)]

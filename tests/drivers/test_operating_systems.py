@@ -7,6 +7,7 @@ import errno
 import importlib.util
 import io
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,12 +36,15 @@ NAMES = {
     "socket": {"AF_UNIX", "SCM_RIGHTS"},
     "select": {"poll", "epoll", "kqueue"},
 }
+NAMED = re.compile(rf"\b({'|'.join(sorted(MODULES.union(*NAMES.values())))})\b")
 ASKS = ("sys.platform", "os.name", "platform.system", "hasattr(")
 
 
 def used(path: Path) -> Iterator[tuple[str, bool]]:
     """(POSIX-only name, whether the block, function or class around it asks for the system) of one module."""
     source = path.read_text(encoding="utf-8")
+    if not NAMED.search(source):
+        return  # most modules: nothing to parse
     lines = source.splitlines()
     for block in ast.parse(source).body:
         text = "\n".join(lines[block.lineno - 1 : block.end_lineno])

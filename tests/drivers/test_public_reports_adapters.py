@@ -110,7 +110,7 @@ def plugged() -> Iterator[Callable[..., tuple[Adapter, SlcanLink]]]:
         yield plug
 
 
-def turn_until(link: SlcanLink, done: Callable[[], bool], limit_s: float = 5.0) -> list[CanFrame]:
+def turn_until(link: SlcanLink, done: Callable[[], bool], limit_s: float = 30.0) -> list[CanFrame]:
     frames: list[CanFrame] = []
     end = time.monotonic() + limit_s
     while not done():

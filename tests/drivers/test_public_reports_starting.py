@@ -88,7 +88,7 @@ def on_port() -> Iterator[Callable[..., tuple[Instrument, SerialLink]]]:
 OnPort = Callable[..., tuple[Instrument, SerialLink]]
 
 
-def poll_until_ready(device: Any, limit_s: float = 5.0) -> None:
+def poll_until_ready(device: Any, limit_s: float = 30.0) -> None:
     end = time.monotonic() + limit_s
     while not device.ready:
         assert time.monotonic() < end
@@ -216,7 +216,7 @@ def test_once_it_has_answered_silence_is_told_as_soon_as_ever(on_port: OnPort) -
     began = time.monotonic()
     with pytest.raises(DeviceSilent):
         poll_until_ready(device)
-    assert time.monotonic() - began < 2.0
+    assert time.monotonic() - began < 10.0
 
 
 # -- what was not understood -----------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ def test_a_controller_that_says_nothing_to_its_settings_measures(on_port: OnPort
     poll_until_ready(device)
     assert UNANSWERED in device.settings.values() and controller.got[-1][0] == "M"
     samples: list[Any] = []
-    end = time.monotonic() + 3.0
+    end = time.monotonic() + 30.0
     while len(samples) < 5:
         assert time.monotonic() < end
         samples += device.poll(time.monotonic())
@@ -341,10 +341,11 @@ def test_a_port_that_stays_busy_is_told_with_the_way_out(monkeypatch: pytest.Mon
     with pytest.raises(DeviceError, match=r"ModemManager.*ID_MM_DEVICE_IGNORE"):
         SerialLink("hv", "/dev/null", 115_200)
     monkeypatch.setattr(serial_link, "modem_manager", lambda: False)
+    monkeypatch.setattr(serial_link, "MODEM_S", 10.0)
     began = time.monotonic()
     with pytest.raises(DeviceError, match="cannot be opened"):
         SerialLink("hv", "/dev/null", 115_200)
-    assert time.monotonic() - began < 0.1  # nobody else is waited for
+    assert time.monotonic() - began < 2.0  # nobody else is waited for
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from drivers.links.link import DeviceError
 from rig.base.certificates import load_certificate
 from rig.base.errors import RigError
 from rig.base.toml_file import parse_table
-from rig.engine.engine import Engine
+from rig.engine import engine as engine_module
+from rig.engine.engine import LONGEST_TURN_S, Engine
 from rig.engine.outcome import Outcome
 from rig.log.reader import read_log
 from rig.log.recorder import Gains
@@ -26,15 +27,9 @@ from rig.protocol.protocol import Protocol
 from rig.run.backend import open_bench
 from rig.scene.scene import Scene
 from rig.sim.bench import SimulatedBench
-from tests.protocols import TO_THE_FILM
+from tests.protocols import TO_THE_FILM, near
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
-# The film of the scenes, so near that the way to it is short.
-NEARER = {
-    "approach_from_mm = 36.0": "approach_from_mm = 3.0",
-    "contact_position_mm = 40.0": "contact_position_mm = 4.0",
-}
-NEAR_HOME = "\n[simulation.stage]\nstart_position_mm = 1.0\n"
 PROTOCOL = (
     TO_THE_FILM
     + """[[step]]
@@ -103,7 +98,8 @@ def tell(tmp_path: Path) -> Tell:
     (old, new) in the text of the scene, which is named as among the fixtures. ``meanwhile(now, bench, control)`` is
     called about five times a second of the run, and as often the story tells the supply's true output. Without
     ``checked`` the plan is not held against the limits beforehand: what is left is what the rig itself refuses.
-    ``nearer`` shortens the way to the film, 40 mm in the scenes.
+    ``nearer`` shortens the way to the film, 40 mm in the scenes. ``quick`` takes a steeper ramp than their
+    300 V/s, and a loop that comes round as seldom as it may on a slow machine: half the turns.
     """
 
     def run(
@@ -120,16 +116,17 @@ def tell(tmp_path: Path) -> Tell:
         checked: bool = True,
         stored_zero: float | None = None,
         nearer: bool = True,
+        quick: bool = True,
     ) -> Story:
         text = (SCENES / f"{scene}.toml").read_text()
         for pair in (replace, also):
             if pair is not None:
                 assert pair[0] in text
                 text = text.replace(*pair)
-        for far, near in NEARER.items() if nearer else ():
-            text = text.replace(far, near)
-        if nearer and "[simulation.stage]" not in text:
-            text += NEAR_HOME
+        if nearer:
+            text = near(text)
+        if quick:
+            text = text.replace("ramp_V_per_s = 300.0", "ramp_V_per_s = 500.0")
         parsed = parse_table(text, Scene, "scene", "test")
         actions = plan(parse_table(protocol, Protocol, "protocol", "test"), parsed)
         if checked:
@@ -156,7 +153,10 @@ def tell(tmp_path: Path) -> Tell:
         path = tmp_path / "run.mcap"
         with LogWriter(path) as log:
             engine = Engine(bench, actions, log, gains, stop, progress, {"force": certificate}, requested, take_down)
-            outcome, error = engine.run()
+            with pytest.MonkeyPatch.context() as patch:
+                if quick:
+                    patch.setattr(engine_module, "SHORTEST_TURN_S", LONGEST_TURN_S)
+                outcome, error = engine.run()
             bench.close()
             if not engine.recorder.log_failed:
                 log.finish(outcome.as_text())

@@ -42,8 +42,8 @@ max_travel_mm = 8.0
 
 @pytest.fixture
 def tell(tell: Tell) -> Tell:
-    """With the scenes' own way to the film."""
-    return partial(tell, nearer=False)
+    """With the scenes' own way to the film, and all turns of the loop."""
+    return partial(tell, nearer=False, quick=False)
 
 
 @dataclass

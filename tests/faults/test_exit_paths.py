@@ -17,13 +17,15 @@ from click.testing import CliRunner
 from drivers.links.link import DeviceLost
 from rig.base.errors import ConfigError, FaultError, LimitError, StaleData
 from rig.cli.app import main
-from rig.engine.engine import Engine
+from rig.engine import engine as engine_module
+from rig.engine.engine import LONGEST_TURN_S, Engine
 from rig.engine.teardown import Teardown
 from rig.log.errors import LogError
 from rig.log.reader import read_log
 from rig.log.writer import LogWriter
 from rig.run import backend
 from rig.sim.bench import SimulatedBench
+from tests.protocols import near
 
 FIXTURES = Path(str(files("sim_fixtures")))
 PROTOCOL = """
@@ -45,11 +47,7 @@ settle_s = 0.1
 do = "hold"
 duration_s = 0.5
 """
-CHANGES = {
-    "approach_from_mm = 36.0": "approach_from_mm = 3.0",
-    "contact_position_mm = 40.0": "contact_position_mm = 5.0",
-    "ramp_V_per_s = 300.0": "ramp_V_per_s = 1000.0",
-}
+QUICKER = ("ramp_V_per_s = 300.0", "ramp_V_per_s = 1000.0")
 
 
 def throw(error: Exception) -> Callable[[Engine], None]:
@@ -108,9 +106,8 @@ class Ending:
         self, folder: Path, monkeypatch: pytest.MonkeyPatch, end: Callable[[Engine], None], stuck: bool
     ) -> None:
         text = (FIXTURES / "scenes" / "cone-4mm.toml").read_text()
-        for old, new in CHANGES.items():
-            assert old in text
-            text = text.replace(old, new)
+        assert QUICKER[0] in text
+        text = near(text).replace(*QUICKER)
         scene, protocol, self.log = folder / "scene.toml", folder / "protocol.toml", folder / "run.mcap"
         scene.write_text(text.replace("../calibrations", str(FIXTURES / "calibrations")))
         protocol.write_text(PROTOCOL)
@@ -134,6 +131,7 @@ class Ending:
                 end(engine)
 
         monkeypatch.setattr(Engine, "_turn", turn_and_end)
+        monkeypatch.setattr(engine_module, "SHORTEST_TURN_S", LONGEST_TURN_S)  # half the turns
         self.result = CliRunner().invoke(main, ["run", str(scene), str(protocol), "-o", str(self.log)])
         assert self.done, self.result.output
 

@@ -300,7 +300,8 @@ def test_a_run_arms_the_supplys_own_trip_and_gives_everything_back(tell: Callabl
 
     story = tell(mischief)
     percent, kill, current, *bounds_and_trip = armed[0]
-    assert percent == pytest.approx(5.0) and kill and current == pytest.approx(5e-5)  # 300 V/s of 6 kV; the scene's
+    assert percent == pytest.approx(100 / 12) and kill  # 500 V/s of 6 kV
+    assert current == pytest.approx(5e-5)  # the scene's
     assert bounds_and_trip == pytest.approx([90.0, 5e-5, 20, OFF_AT_ONCE])
     assert story.outcome.safe and abs(story.final_output) < 60
     assert settings(story.bench) == pytest.approx((10.0, False, 1e-3, 0.0, 0.0, 0, DISABLED))

@@ -77,7 +77,7 @@ def test_an_orderly_end_is_prompt(tell: Tell, scene: str) -> None:
     story = tell(lambda bench, control: control.ask("a test"), scene=scene)
     assert story.outcome.safe and story.final_output < SAFE_VOLTAGE
     assert "emergency_off" not in story.control_words
-    assert story.took < 1000 / 300 + 1.0
+    assert story.took < 1000 / 500 + 1.0
 
 
 def test_the_stage_stands_before_a_guard_that_hangs_is_waited_for(tell: Tell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +115,7 @@ def test_an_output_found_live_is_taken_down_at_the_ramp_of_the_scene(tell: Tell,
     path = story.outputs
     high = max(t for t, volts in path if volts > 495)
     low = next(t for t, volts in path if t > high and volts < 5)
-    assert low - high == pytest.approx(500 / 300, abs=0.5)  # told five times a second; else 17 s and 0.4 s
+    assert low - high == pytest.approx(500 / 500, abs=0.4)  # told five times a second; else 17 s and 0.4 s
 
 
 # The guard's process without an engine that sees to it -----------------------------------------------------------

@@ -53,7 +53,7 @@ def test_lines_doubled_torn_and_late_change_nothing(tell_other: Tell) -> None:
         for kind in ("duplicate", "split", "delay"):
             bench.inject(Fault(role="hv", kind=kind, value=0.02, probability=0.2))
 
-    story = tell_other(mischief)
+    story = tell_other(mischief, quick=False)  # on the scene's own ramp, which takes many set-points
     assert story.error is None, story.error
     assert story.outcome.safe and story.final_output == 0.0
     assert max(targets) <= 1000.5 and len(targets) > 20
@@ -69,7 +69,7 @@ def test_damaged_answers_never_raise_the_voltage(tell_other: Tell, seed: int) ->
         bench.inject(Fault(role="hv", kind="corrupt", probability=0.1))
         stop.ask("a test")  # so that the ramp down is what meets the damage
 
-    story = tell_other(mischief, replace=("seed = 4", f"seed = {seed}"))
+    story = tell_other(mischief, replace=("seed = 4", f"seed = {seed}"), quick=False)
     assert len(targets) > 10 and max(targets) <= 1000.5
     assert story.final_output < 60
 

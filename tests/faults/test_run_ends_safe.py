@@ -21,7 +21,7 @@ from rig.sim.bench import SimulatedBench
 from rig.sim.truth import Fault
 
 Tell = Callable[..., Any]  # of conftest.Story
-RAMP_DOWN_S = 1000 / 300 + 1.0  # from 1000 V at the scene's 300 V/s, and a second for polling
+RAMP_DOWN_S = 1000 / 500 + 1.0  # from 1000 V at 500 V/s, and a second for polling
 AT_ONCE_S = 1.5
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -30,6 +31,12 @@ METERS = {
     "ascii-stream": '[monitor]\ndriver = "ascii-stream"\nquantity = "voltage"\n',
     "labjack-monitor": '[monitor]\ndriver = "labjack-monitor"\nquantity = "voltage"\nfactor = 1000.0\n',
 }
+
+
+@pytest.fixture
+def tell(tell: Tell) -> Tell:
+    """With the ramp of the scenes: what a second reading may lag behind depends on it."""
+    return partial(tell, quick=False)
 
 
 def with_meter(driver: str = "scpi", more: str = "") -> tuple[str, str]:

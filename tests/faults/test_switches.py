@@ -9,6 +9,7 @@ protocol cannot show the damage, a wrong value may end the run or not, and the o
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -177,6 +178,12 @@ SEEN_DAMAGE = {
     "iseg-edcp": ("bad_frames", "bad_values", "unexpected_frames", "retries"),
     "shvps": ("bad_grammar", "retries", "doubted", "implausible"),
 }
+
+
+@pytest.fixture
+def tell(tell: Tell) -> Tell:
+    """With the ramp of the scenes: the chances of the faults are drawn for it."""
+    return partial(tell, quick=False)
 
 
 def counted(story: Any, role: str) -> dict[str, int]:

@@ -35,7 +35,7 @@ def test_a_film_of_each_law_is_identified(name: str, experiment) -> None:  # typ
     curves: list[Curve] = experiment(
         seed=3, truth=truth, guess=GUESS, voltages=(0.0, 1300.0), samples=400, noise=5e-4, disks=(4e-3,)
     )
-    found = identify(curves, law=truth.law, starts=4)
+    found = identify(curves, law=truth.law, starts=2)
     assert found.material.law is truth.law
     assert found.lack_of_fit_probability > 1e-3
     names = list(found.quantities)

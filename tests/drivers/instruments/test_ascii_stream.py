@@ -24,7 +24,7 @@ from drivers.instruments.ascii_stream import (
 from drivers.links.link import DeviceRefused, DeviceSilent
 from drivers.roles import OK, SampleFlag
 from rig.cli.app import main
-from tests.protocols import TO_THE_FILM
+from tests.protocols import TO_THE_FILM, near
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 PASSIVE = (
@@ -210,7 +210,9 @@ def test_keys_that_make_no_sense_are_refused(keys: dict[str, Any], word: str) ->
 
 def test_a_run_and_its_replay(tmp_path: Path) -> None:
     log = tmp_path / "a.mcap"
-    scene, protocol = SCENES / "streams.toml", tmp_path / "p.toml"
+    scene, protocol = tmp_path / "streams.toml", tmp_path / "p.toml"
+    text = (SCENES / "streams.toml").read_text().replace("../calibrations", (SCENES.parent / "calibrations").as_posix())
+    scene.write_text(near(text))
     protocol.write_text(PASSIVE)
     done = CliRunner().invoke(main, ["run", str(scene), str(protocol), "-o", str(log)])
     assert done.exit_code == 0, done.output

@@ -67,7 +67,7 @@ def own_temporary_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def arrived(link: SerialLink, count: int) -> bytes:
-    data, end = b"", time.monotonic() + 5
+    data, end = b"", time.monotonic() + 30
     while len(data) < count and time.monotonic() < end:
         select.select([link.fileno()], [], [], 0.1)
         data += link.read()
@@ -80,9 +80,12 @@ def test_is_a_byte_link_named_by_its_port(link: SerialLink, other_end: Pty) -> N
 
 
 def test_bytes_go_both_ways_and_nothing_waits(link: SerialLink, other_end: Pty) -> None:
-    begin = time.monotonic()
-    assert link.read() == b""
-    assert time.monotonic() - begin < 0.05
+    tries = []
+    for _ in range(5):  # a busy machine may hold up one of them
+        begin = time.monotonic()
+        assert link.read() == b""
+        tries.append(time.monotonic() - begin)
+    assert min(tries) < 0.05
     link.write(b"/1 0 00 get pos:2D\n")
     assert other_end.read(19) == b"/1 0 00 get pos:2D\n"
     every_byte = bytes(range(256)) * 4

@@ -23,8 +23,11 @@ def film(lp: float) -> Specimen:
 
 
 # Peak fields (MV/m) at which the Parker film (a = 4 mm) loses hoop tension, h = 4 to 12 mm: from
-# three independent codes.
-@pytest.mark.parametrize(("lp", "low", "high"), [(1.0, 17, 48), (1.1, 60, 66), (1.2, 81, 84), (1.3, 102, 104)])
+# three independent codes. Without pre-stretch a state takes seconds.
+@pytest.mark.parametrize(
+    ("lp", "low", "high"),
+    [pytest.param(1.0, 17, 48, marks=pytest.mark.slow), (1.1, 60, 66), (1.2, 81, 84), (1.3, 102, 104)],
+)
 def test_field_at_loss_of_tension(lp: float, low: float, high: float) -> None:
     limit = taut_limit(film(lp), np.array([4e-3, 8e-3, 12e-3]))
     field = limit.peak_field / 1e6

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.importing.findings import ImportRefused
+from rig.importing.findings import ImportRefused, spans
+from rig.importing.headings import split_unit
 from rig.importing.options import ImportOptions, from_words
 from rig.importing.sheet_table import SheetTests, read_sheet_tests
+from rig.importing.table import TextRow, _unit_row_above
 
 G = 0.25e6  # Pa, a neo-Hookean sheet: P = G (l - l^-2)
 STRETCH = np.round(np.linspace(1.0, 2.0, 41), 6)
@@ -301,6 +303,7 @@ def test_cycles_break_toe_offset_and_stiffness_are_told(tmp_path: Path) -> None:
     broken = "stretch,stress_kPa\n" + rows([*STRETCH, 2.02, 2.04], [*(STRESS / 1e3), 3.0, 1.0])
     found = read(tmp_path, "uniaxial.csv", broken)
     assert found.tests[0].stretch1.size == 41 and "broke" in "\n".join(found.understood[0].lines())
+    assert found.understood[0].left_out["after the break"] == [43, 44]
     toe = "stretch,stress_kPa\n" + rows(
         np.linspace(1.0, 2.2, 49), np.interp(np.linspace(1.0, 2.2, 49), STRETCH + 0.2, STRESS, left=0.0) / 1e3
     )
@@ -322,6 +325,32 @@ def test_a_jump_and_compression_counted_positive_are_refused(tmp_path: Path) -> 
     short = np.linspace(1.0, 0.6, 30)
     message = refused(tmp_path, "uniaxial.csv", "stretch,stress_kPa\n" + rows(short, -G * (short - short**-2) / 1e3))
     assert "tension" in message and "--sign stress=-" in message
+
+
+@pytest.mark.parametrize(
+    ("heading", "name", "unit", "known"),
+    [
+        ("Stress (eng)", "Stress (eng)", "", False),  # a word of the name
+        ("Weg (Soll)", "Weg (Soll)", "", False),
+        ("Kraft [mN]", "Kraft", "mN", True),
+        ("Load (psf)", "Load", "psf", False),  # meant for a unit, which has to be asked for
+        ("Force (smoothed)", "Force (smoothed)", "", False),
+    ],
+)
+def test_what_stands_in_brackets_is_a_unit_or_belongs_to_the_name(
+    heading: str, name: str, unit: str, known: bool
+) -> None:
+    found = split_unit(heading)
+    assert found[:2] == (name, unit) and (found[2] is not None) == known
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [([7], "7"), ([3, 4], "3-4"), ([19, 3, 17, 18, 18], "3, 17-19"), ([1, 3, 5, 7], "1, 3, 5, 7"),
+     ([1, 3, 5, 7, 9], "1, 3, 5, 7 and more"), ([1, 3, 5, 7, 9, 11], "1, 3, 5, 7 and more")],
+)  # fmt: skip
+def test_lines_are_named_in_spans_and_not_more_than_four(lines: list[int], said: str) -> None:
+    assert spans(lines) == said
 
 
 def test_options_stand_beside_the_data(tmp_path: Path) -> None:
@@ -395,3 +424,11 @@ def test_headings_are_understood(heading: str, quantity: str, unit: str | None) 
     found = understand(heading)
     assert found.quantity == quantity
     assert (found.unit.name if found.unit else None) == unit
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 5])
+def test_a_row_of_units_that_says_so_is_found_beside_one_channel_and_many(channels: int) -> None:
+    row = TextRow(7, ["Y_Unit_Label", *["N"] * channels])
+    found = _unit_row_above([TextRow(3, ["Operator", "N"]), row], channels + 1)
+    assert found == (7, ["s", *["N"] * channels])
+    assert _unit_row_above([TextRow(7, ["Y_Unit_Label", *["Ann"] * channels])], channels + 1) is None

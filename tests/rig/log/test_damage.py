@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -260,47 +260,57 @@ def stock_metadata_with_evil_names() -> bytes:
 
 CLAIM = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 2**40) + bytes(20)  # a zstd frame's head with its content size
 
-HOSTILE: dict[str, bytes] = {
-    "bomb of 1 GiB": HEAD + chunk(b"", size=2**30, data=bomb(2**30)) + GOOD,
-    "bomb that declares 100 bytes": HEAD + chunk(bytes(100), data=bomb(2**30)) + GOOD,
-    "frame that claims 1 TiB": HEAD + chunk(b"", size=100, data=CLAIM) + GOOD,
-    "many bombs within the cap": HEAD + chunk(bytes(2**24), size=2**24) * 500 + GOOD,
-    "a million empty messages": HEAD + chunk(described() + record(5, b"") * 1_000_000) + GOOD,
-    "half a million short messages": HEAD + chunk(described() + message(b"") * 500_000) + GOOD,
-    "messages of length 5": HEAD + chunk(described() + record(5, b"12345")) + GOOD,
-    "message beyond the chunk": HEAD + chunk(described() + struct.pack("<BQ", 5, 2**40) + bytes(40)) + GOOD,
-    "zero tail of 16 MiB": HEAD + GOOD + bytes(2**24),
-    "opcode zero": HEAD + bytes(9) + GOOD,
-    "length 2^63": HEAD + struct.pack("<BQ", 6, 2**63) + GOOD,
-    "length 2^64 - 1": HEAD + struct.pack("<BQ", 9, 2**64 - 1) + GOOD,
-    "inner length 2^62": HEAD + record(9, bytes(24) + struct.pack("<Q", 2**62) + bytes(9)) + GOOD,
-    "unknown compression": HEAD + chunk(described() + message(FORCE), compression=b"evil") + GOOD,
-    "lz4": HEAD + chunk(described() + message(FORCE), compression=b"lz4") + GOOD,
-    "text that is not UTF-8": HEAD + record(0xC, text(b"\xff\xfe") + text(b"")) + GOOD,
-    "channel nowhere described": HEAD + chunk(message(FORCE, channel=9)) + GOOD,
-    "message outside a chunk": HEAD + described() + message(FORCE) + GOOD,
-    "70000 channels": HEAD + chunk(b"".join(described() for _ in range(2)) + b"".join(
+# Made only when a test asks: all of them take seconds and 100 MB.
+HOSTILE: dict[str, Callable[[], bytes]] = {
+    "bomb of 1 GiB": lambda: HEAD + chunk(b"", size=2**30, data=bomb(2**30)) + GOOD,
+    "bomb that declares 100 bytes": lambda: HEAD + chunk(bytes(100), data=bomb(2**30)) + GOOD,
+    "frame that claims 1 TiB": lambda: HEAD + chunk(b"", size=100, data=CLAIM) + GOOD,
+    "many bombs within the cap": lambda: HEAD + chunk(bytes(2**24), size=2**24) * 500 + GOOD,
+    "a million empty messages": lambda: HEAD + chunk(described() + record(5, b"") * 1_000_000) + GOOD,
+    "half a million short messages": lambda: HEAD + chunk(described() + message(b"") * 500_000) + GOOD,
+    "messages of length 5": lambda: HEAD + chunk(described() + record(5, b"12345")) + GOOD,
+    "message beyond the chunk": lambda: HEAD + chunk(described() + struct.pack("<BQ", 5, 2**40) + bytes(40)) + GOOD,
+    "zero tail of 16 MiB": lambda: HEAD + GOOD + bytes(2**24),
+    "opcode zero": lambda: HEAD + bytes(9) + GOOD,
+    "length 2^63": lambda: HEAD + struct.pack("<BQ", 6, 2**63) + GOOD,
+    "length 2^64 - 1": lambda: HEAD + struct.pack("<BQ", 9, 2**64 - 1) + GOOD,
+    "inner length 2^62": lambda: HEAD + record(9, bytes(24) + struct.pack("<Q", 2**62) + bytes(9)) + GOOD,
+    "unknown compression": lambda: HEAD + chunk(described() + message(FORCE), compression=b"evil") + GOOD,
+    "lz4": lambda: HEAD + chunk(described() + message(FORCE), compression=b"lz4") + GOOD,
+    "text that is not UTF-8": lambda: HEAD + record(0xC, text(b"\xff\xfe") + text(b"")) + GOOD,
+    "channel nowhere described": lambda: HEAD + chunk(message(FORCE, channel=9)) + GOOD,
+    "message outside a chunk": lambda: HEAD + described() + message(FORCE) + GOOD,
+    "70000 channels": lambda: HEAD + chunk(b"".join(described() for _ in range(2)) + b"".join(
         record(4, struct.pack("<HH", k, 1) + text(b"/x%d" % k) + text(b"") + text(b"")) for k in range(60_000))) + GOOD,
-    "100000 attachments": HEAD + b"".join(
+    "100000 attachments": lambda: HEAD + b"".join(
         record(9, body + struct.pack("<I", zlib.crc32(body))) for body in (
             bytes(16) + text(b"%d" % k) + text(b"") + struct.pack("<Q", 0) for k in range(100_000))) + GOOD,
-    "100000 broken landmarks": HEAD + b"\x06\xff\xff\xff\x00\x00\x00\x00\x00" * 200_000 + GOOD,
-    "100000 damaged chunks": HEAD + chunk(b"", size=9, data=b"") * 100_000 + GOOD,
-    "chunk inside chunk": HEAD + chunk(GOOD) + GOOD,
-    "times beyond 2^63": HEAD + chunk(described() + record(5, struct.pack("<HIQQ", 1, 1, 2**63, 0) + FORCE)) + GOOD,
-    "payload that is not a message": HEAD + chunk(described() + message(b"\xff" * 20)) + GOOD,
-    "evil names": stock_metadata_with_evil_names(),
-    "header only": HEAD,
-    "8 million one-byte messages": HEAD + chunk(b"", size=2**28, data=bomb(2**28, message(b"x"))) + GOOD,
-    "2000 indexes of one large chunk": HEAD + chunk(b"", size=2**28, data=bomb(2**28)) + GOOD + record(15, bytes(4))
+    "100000 broken landmarks": lambda: HEAD + b"\x06\xff\xff\xff\x00\x00\x00\x00\x00" * 200_000 + GOOD,
+    "100000 damaged chunks": lambda: HEAD + chunk(b"", size=9, data=b"") * 100_000 + GOOD,
+    "chunk inside chunk": lambda: HEAD + chunk(GOOD) + GOOD,
+    "times beyond 2^63": lambda: HEAD + chunk(
+        described() + record(5, struct.pack("<HIQQ", 1, 1, 2**63, 0) + FORCE)) + GOOD,
+    "payload that is not a message": lambda: HEAD + chunk(described() + message(b"\xff" * 20)) + GOOD,
+    "evil names": stock_metadata_with_evil_names,
+    "header only": lambda: HEAD,
+    "8 million one-byte messages": lambda: HEAD + chunk(b"", size=2**28, data=bomb(2**28, message(b"x"))) + GOOD,
+    "2000 indexes of one large chunk": lambda: HEAD + chunk(b"", size=2**28, data=bomb(2**28)) + GOOD
+    + record(15, bytes(4))
     + record(8, struct.pack("<QQQQ", 0, 0, len(HEAD), 2**20) + bytes(4 + 8) + text(b"zstd") + bytes(16)) * 2000
     + record(2, bytes(20)) + MAGIC,
-    "footer that points to 2^63": HEAD + GOOD + record(15, bytes(4)) + record(2, struct.pack("<QQI", 2**63, 2**63, 0))
-    + MAGIC,
-    "magic only": MAGIC,
-    "empty": b"",
-    "random": MAGIC + random.Random(1).randbytes(2_000_000),
+    "footer that points to 2^63": lambda: HEAD + GOOD + record(15, bytes(4))
+    + record(2, struct.pack("<QQI", 2**63, 2**63, 0)) + MAGIC,
+    "magic only": lambda: MAGIC,
+    "empty": lambda: b"",
+    "random": lambda: MAGIC + random.Random(1).randbytes(2_000_000),
 }  # fmt: skip
+LARGE = {"zero tail of 16 MiB", "100000 attachments", "100000 broken landmarks", "100000 damaged chunks", "random"}
+
+
+@functools.cache
+def made(name: str) -> bytes:
+    return HOSTILE[name]()
+
 
 READ = """
 import json, sys, time
@@ -334,8 +344,10 @@ print(json.dumps(costs))
 def hostile_costs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Any, float, float, float]]:
     """For each file: what came of it, processor seconds, peak MiB above before, its size in MiB."""
     folder = tmp_path_factory.mktemp("hostile")
-    for number, content in enumerate(HOSTILE.values()):
-        (folder / f"{number:03}.mcap").write_bytes(content)
+    sizes = {}
+    for number, name in enumerate(HOSTILE):
+        sizes[name] = (folder / f"{number:03}.mcap").write_bytes(made(name)) / 2**20
+    assert {name for name, size in sizes.items() if size >= 1.0} == LARGE
     done = subprocess.run(
         [sys.executable, "-c", READ, folder],
         capture_output=True,
@@ -345,10 +357,7 @@ def hostile_costs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[A
     )
     assert done.returncode == 0, done.stderr
     costs = json.loads(done.stdout)
-    return {
-        name: (*costs[f"{number:03}.mcap"], len(content) / 2**20)
-        for number, (name, content) in enumerate(HOSTILE.items())
-    }
+    return {name: (*costs[f"{number:03}.mcap"], sizes[name]) for number, name in enumerate(HOSTILE)}
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -359,14 +368,14 @@ def test_hostile(name, hostile_costs):
     if not isinstance(what, str):
         n, gaps = what
         assert gaps > 0
-        if HOSTILE[name].endswith(GOOD) and name != "100000 damaged chunks":
+        if made(name).endswith(GOOD) and name != "100000 damaged chunks":
             assert n >= 1  # the sound chunk behind the evil one is found
 
 
-@pytest.mark.parametrize("name", [name for name, content in HOSTILE.items() if len(content) < 2**20])
+@pytest.mark.parametrize("name", [name for name in HOSTILE if name not in LARGE])
 def test_commands_on_hostile_logs(name, tmp_path):
     path = tmp_path / "evil.mcap"
-    path.write_bytes(HOSTILE[name])
+    path.write_bytes(made(name))
     use(path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["evil.mcap"]
 
@@ -374,7 +383,7 @@ def test_commands_on_hostile_logs(name, tmp_path):
 def test_names_from_a_log_are_data(tmp_path):
     """A foreign log may name its attachments and topics as it likes; nothing is done with the names."""
     path = tmp_path / "evil.mcap"
-    path.write_bytes(HOSTILE["evil names"])
+    path.write_bytes(made("evil names"))
     log = read_log(path)
     assert list(log.attachments) == ["../../../etc/passwd"]
     assert log.topics == {}

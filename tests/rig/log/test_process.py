@@ -175,10 +175,10 @@ def test_a_log_that_is_deleted_while_it_is_written_is_noticed_and_saved(tmp_path
             folder.rmdir()
         began = RealClock()
         while True:
-            assert began.now() < 5.0
+            assert began.now() < 30.0
             log.tick(began.now())
             time.sleep(0.01)
-    assert began.now() < 2.0
+    assert began.now() < 10.0
     saved = Path(str(caught.value).split("saved in ")[1].rstrip("."))
     assert read_log(saved).topics["/force/sample"] > 0
     assert saved.parent == (folder if how in ("deleted", "replaced") else tmp_path / "tmp")

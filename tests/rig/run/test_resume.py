@@ -24,6 +24,7 @@ from rig.protocol.protocol import Protocol
 from rig.run.resume import prepare_resumed
 from rig.run.run import run
 from rig.scene.scene import Scene, load_scene
+from tests.protocols import near
 
 SCENE = Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml"
 PROTOCOL = """
@@ -83,9 +84,10 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stopped")
     protocol = folder / "protocol.toml"
     protocol.write_text(PROTOCOL)
-    log = folder / "first.mcap"
+    log, scene = folder / "first.mcap", folder / "scene.toml"
+    scene.write_text(near(SCENE.read_text().replace("../calibrations", (SCENE.parents[1] / "calibrations").as_posix())))
     with pytest.raises(Stopped):
-        run(prepare(SCENE, protocol), log, stop_when("step 9 ramp"))
+        run(prepare(scene, protocol), log, stop_when("step 9 ramp"))
     return log
 
 

@@ -30,6 +30,7 @@ from rig.protocol.experiment import prepare
 from rig.run.backend import open_bench
 from rig.run.run import run as run_experiment
 from rig.sim.bench import SimulatedBench
+from tests.protocols import near
 
 FIXTURES = Path(str(files("sim_fixtures")))
 SCENE = FIXTURES / "scenes" / "other-instruments.toml"
@@ -77,7 +78,9 @@ class Story:
 def tell(folder: Path, *, mischief: Callable[[Control], None] | None = None, gains: Gains | None = None) -> Story:
     protocol, path = folder / "protocol.toml", folder / "run.mcap"
     protocol.write_text(PROTOCOL)
-    experiment = prepare(SCENE, protocol)
+    scene = folder / "scene.toml"
+    scene.write_text(near(SCENE.read_text().replace("../calibrations", (FIXTURES / "calibrations").as_posix())))
+    experiment = prepare(scene, protocol)
     bench, stop = open_bench(experiment.scene), Control(unattended="a test")
     simulated, clock = bench.simulated, bench.clock
     assert simulated is not None

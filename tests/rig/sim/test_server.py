@@ -113,11 +113,16 @@ def test_instruments_answer_beside_each_other(serve):
 def test_it_runs_in_real_time(serve):
     server = serve("stage", stage={"referenced_at_start": True})
     with port(server, "stage") as stage:
-        start = time.monotonic()
-        stage.write(b"/1 1 move abs 60472\n")  # 18 mm at 20 mm/s and 200 mm/s^2
-        while b"IDLE" not in stage.readline():
-            stage.write(b"/1 1\n")
-        assert time.monotonic() - start == pytest.approx(18 / 20 + 0.1, abs=0.15)
+        for target in (60472, 0, 60472):  # a busy machine may be late once, and never early
+            start = time.monotonic()
+            stage.write(b"/1 1 move abs %d\n" % target)  # 18 mm at 20 mm/s and 200 mm/s^2
+            while b"IDLE" not in stage.readline():
+                stage.write(b"/1 1\n")
+            took = time.monotonic() - start
+            assert took > 18 / 20 - 0.05
+            if took < 18 / 20 + 0.25:
+                break
+        assert took == pytest.approx(18 / 20 + 0.1, abs=0.15)
 
 
 def test_a_host_that_does_not_read_costs_frames_not_the_server(serve):

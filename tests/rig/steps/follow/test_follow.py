@@ -29,7 +29,8 @@ def nobody(done, total, label):
 def short(tmp_path_factory, write_bench):
     """One release against a mass."""
     folder = tmp_path_factory.mktemp("mass")
-    run(prepare(*write_bench(folder, ["mass"], [1300.0], average_s=2.0)), folder / "log.mcap", nobody)
+    near = "approach_from_mm = 36.0 -> approach_from_mm = 3.0\ncontact_position_mm = 40.0 -> contact_position_mm = 4.0"
+    run(prepare(*write_bench(folder, ["mass"], [1300.0], near, average_s=2.0)), folder / "log.mcap", nobody)
     return folder / "log.mcap"
 
 
