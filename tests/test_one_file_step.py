@@ -119,23 +119,29 @@ def test_its_errors_list_its_own_keys_and_its_plan_refuses_in_the_family(other_p
     assert name.returncode == 2 and 'did you mean "knock"?' in name.stderr
 
 
-@pytest.mark.parametrize(
-    ("spoilt", "words"),
-    [
-        ("import no_such_module_at_all\n", "no_such_module_at_all"),
-        ("Knock = 7\n", "is no rig.steps.base.Step"),
-        (STEP.replace('"knock"', '"tap"'), "its `do` is 'tap'"),
-    ],
-)
-def test_one_that_cannot_be_loaded_names_its_package_and_leaves_other_protocols_alone(
-    other_package: Path, spoilt: str, words: str
-) -> None:
-    (other_package / "knocking.py").write_text(spoilt)
-    scene, protocol, without = SCENES / "no-hv.toml", other_package / "protocol.toml", other_package / "without.toml"
-    without.write_text(PROTOCOL.split('[[step]]\ndo = "knock"')[0])
-    done, other = dea_rig(str(other_package), ["check", scene, protocol], ["check", scene, without])
-    assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert "package knocking-for-rigs" in done.stderr and words in done.stderr
+SPOILT = {
+    "knock": ("import no_such_module_at_all\n", "no_such_module_at_all"),
+    "rap": ("Knock = 7\n", "is no rig.steps.base.Step"),
+    "bang": (STEP.replace('"knock"', '"tap"'), "its `do` is 'tap'"),
+}
+
+
+def test_those_that_cannot_be_loaded_name_their_package_and_leave_other_protocols_alone(tmp_path: Path) -> None:
+    scene, without = SCENES / "no-hv.toml", tmp_path / "without.toml"
+    beginning = PROTOCOL.split('[[step]]\ndo = "knock"')[0]
+    without.write_text(beginning)
+    for do, (text, _) in SPOILT.items():
+        (tmp_path / f"package_{do}.py").write_text(text)
+        about = tmp_path / f"{do}_for_rigs-1.0.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {do}-for-rigs\nVersion: 1.0\n")
+        (about / "entry_points.txt").write_text(f"[dea_rig.steps]\n{do} = package_{do}:Knock\n")
+        (tmp_path / f"{do}.toml").write_text(f'{beginning}[[step]]\ndo = "{do}"\ndepth_mm = 0.8\n')
+    commands = [["check", scene, tmp_path / f"{do}.toml"] for do in SPOILT]
+    *done, other = dea_rig(str(tmp_path), *commands, ["check", scene, without])
+    for (do, (_, words)), one in zip(SPOILT.items(), done, strict=True):
+        assert one.returncode == 2 and "Traceback" not in one.stderr
+        assert f"package {do}-for-rigs" in one.stderr and words in one.stderr
     assert other.returncode == 0, other.stderr
 
 

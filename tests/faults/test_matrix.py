@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from drivers.dialogue import LOST_AGAIN_S
 from drivers.instruments.ascii_stream import AsciiForce
 from drivers.instruments.cia404.device import CiA404
 from drivers.instruments.gsv8.device import GSV8
@@ -449,3 +450,26 @@ def test_every_switch_is_met_as_required(driver: str, kind: str) -> None:
 
 def test_what_is_required_is_required_of_switches_that_there_are() -> None:
     assert set(REQUIRED) == set(CASES) and set(BLIND) <= set(CASES)
+
+
+ROUND_TRIPS = {"round_trips", "round_trip_sum_us", "round_trip_max_us"}  # what a counter counts that is no trouble
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_on_a_clean_line_no_trouble_is_counted(driver: str) -> None:
+    watched = Watched(driver)
+    before = dict(watched.device.counters)
+    watched.run(3.0)
+    rose = {key for key, count in watched.device.counters.items() if count != before.get(key, 0)}
+    assert rose <= ROUND_TRIPS
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_a_lost_port_is_looked_for_again_at_intervals(driver: str) -> None:
+    watched = Watched(driver)
+    watched.bench.inject(Fault.model_validate({"role": watched.role, "kind": "vanish", "duration_s": 60.0}))
+    with pytest.raises(DeviceLost):
+        while True:
+            watched.clock.sleep_until(watched.t + 0.005)
+            watched.device.poll(watched.t)
+    assert watched.device.next_poll == pytest.approx(watched.t + LOST_AGAIN_S)

@@ -44,7 +44,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def curves(experiment: Experiment) -> list[Curve]:
-    made = experiment(seed=12, samples=400, guess=replace(PARKER, name="start"))
+    made = experiment(seed=12, samples=200, guess=replace(PARKER, name="start"))
     return [replace(curve, label=f"{curve.label} {ATTACK}" if k == 0 else curve.label) for k, curve in enumerate(made)]
 
 

@@ -324,6 +324,16 @@ def test_lost_frames_are_noticed_by_rate() -> None:
     assert rig.force.counters["lost_samples"] == 5
 
 
+def test_process_data_of_another_length_are_counted_and_never_a_value() -> None:
+    rig = Rig().until_ready()
+    rig.run(0.105)
+    assert len(rig.samples) == 10 and rig.force.counters["ignored_frames"] == 0
+    for data in (b"", bytes(4), bytes(6)):
+        rig.node.inbox.append(CanFrame(0x185, data))
+    rig.run(0.1)
+    assert rig.force.counters["ignored_frames"] == 3 and len(rig.samples) == 20
+
+
 @pytest.mark.parametrize(
     ("status", "flags"),
     [

@@ -6,10 +6,11 @@ import math
 import random
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers import roles
+from drivers.instruments.zaber import NumberedLines
 from drivers.instruments.zaber.codec import WARNINGS, Alert, Codec, Info, Message, Reply, checksum, encode
 from drivers.instruments.zaber.device import ZaberStage
 from drivers.links.link import DeviceLost, DeviceRefused, DeviceSilent
@@ -138,6 +139,7 @@ infos = st.builds(
 streams = st.lists(st.one_of(replies, alerts, infos, st.text(st.characters(max_codepoint=255), max_size=9)), max_size=8)
 
 
+@settings(max_examples=50)  # each with a dozen cuts
 @given(streams, st.data())
 def test_any_split_decodes_to_the_same_messages(texts: list[str], data: st.DataObject) -> None:
     wire = b"".join(f"{text}:{sum(map(ord, text[1:])) * 255 % 256:02X}\r\n".encode("latin-1") for text in texts)
@@ -744,3 +746,27 @@ def test_noise_on_the_line_costs_retries_and_nothing_else(homed: Bench) -> None:
     assert len(homed.samples) > 200
     counters = homed.stage.counters
     assert counters["bad_checksum"] > 10 and counters["retries"] > 10
+
+
+@pytest.mark.parametrize(
+    ("earlier", "later", "replaces"),
+    [
+        (b"1 0 move abs 100", b"1 0 stop", True),
+        (b"1 0 move abs 100", b"1 0 move abs 90", True),
+        (b"1 0 move abs 100", b"1 0 get pos", False),
+        (b"1 0 stop", b"1 0 stop", False),
+        (b"1 0 get pos", b"1 0 move abs 90", False),
+    ],
+)
+def test_in_a_served_log_a_halt_may_stand_for_a_motion_and_for_nothing_else(
+    earlier: bytes, later: bytes, replaces: bool
+) -> None:
+    assert NumberedLines(b"\n").replaces(earlier, later) is replaces
+
+
+@pytest.mark.parametrize(("steps", "alike"), [(0, True), (20, True), (-20, True), (21, False), (-21, False)])
+def test_in_a_served_log_a_motion_is_alike_within_twenty_steps(steps: int, alike: bool) -> None:
+    dialect = NumberedLines(b"\n")
+    assert dialect.alike(b"1 0 move abs 1000", b"1 0 move abs %d" % (1000 + steps)) is alike
+    assert not dialect.alike(b"1 0 move abs 1000", b"2 0 move abs 1000")
+    assert dialect.alike(b"1 0 get pos", b"1 0 get pos") and not dialect.alike(b"1 0 get pos", b"1 0 stop")
