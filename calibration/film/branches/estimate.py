@@ -24,12 +24,12 @@ def error_of_elastic_fit(curves: Sequence[Curve], film: Material, held: Collecti
     joint = Joint(records_of_curves(curves), film, film.terms, tuple(held))
     x = joint.vector(film)
     joint.settle(x)
-    here = joint.minimise(x)
+    here = joint.minimise(joint.evaluate(x))
     for more in range(MOST, 0, -1):
         start = guess(joint, here, more)
         if start is not None:
             joint.settle(start)
-            there = joint.coordinates.film(joint.minimise(start).x)
+            there = joint.coordinates.film(joint.minimise(joint.evaluate(start)).x)
             found = {"stiffness": film.shear_modulus / there.shear_modulus - 1.0}
             if joint.coordinates.electric:
                 found["eps_r"] = film.eps_r / there.eps_r - 1.0

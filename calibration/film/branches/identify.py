@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.joint import SOFTENING, Joint
-from calibration.film.branches.record import Record
+from calibration.film.branches.counting import Count, misfit
+from calibration.film.branches.joint import SOFTENING, Joint, Point
+from calibration.film.branches.record import Record, thinned
 from calibration.film.branches.result import (
     HOLD,
     USUAL,
@@ -27,7 +28,7 @@ from calibration.film.branches.result import (
     Trace,
     blind_times,
 )
-from calibration.film.branches.spectrum import Count, Unseen, count_branches, covariance, misfit, unseen
+from calibration.film.branches.spectrum import Unseen, count_branches, covariance, unseen
 from calibration.film.curve import Curve
 from calibration.film.differences import DIMENSIONS
 from calibration.film.identify import identify
@@ -49,6 +50,7 @@ from model.material.law import stack
 
 Array = NDArray[np.float64]
 
+FEW, STARTS = 600, 3  # samples of a curve, and starts, of the elastic fit that begins the search
 FITTED_ALONG = NUISANCES | {SOFTENING: "1"}  # errors of the rig and of the film, by their unit
 
 
@@ -83,7 +85,8 @@ def identify_branches(
     if not any(record.used.any() for record in records):
         raise IdentificationError("no sample of the runs' histories is a measurement of the film")
     options: dict[str, Any] = {**settings, "terms": terms, "fixed": held, "fixed_stretch": fixed_stretch}
-    elastic = identify(curves, **(options | {"profiles": False}))
+    first = {"profiles": False, "starts": min(STARTS, settings.get("starts", STARTS))}
+    elastic = identify([thinned(curve, FEW) for curve in curves], **(options | first))
     joint = Joint(records, elastic.material, terms, tuple(held))
     tried = count_branches(joint, joint.vector(elastic.material), branches)
     if branches is not None and tried[-1].branches != branches:
@@ -101,7 +104,7 @@ def identify_branches(
 class _Found:
     """The joint fit at its end, and what follows from it."""
 
-    def __init__(self, joint: Joint, tried: Sequence[Count], wanted: int | None) -> None:
+    def __init__(self, joint: Joint, tried: Sequence[Count[Point]], wanted: int | None) -> None:
         self.joint, self.tried, self.point, self.wanted = joint, tried, tried[-1].point, wanted
         self.scale = misfit(joint, self.point)
         self.covariance = covariance(joint, self.point)
@@ -109,7 +112,7 @@ class _Found:
         self.effects = {part: self.response @ rows for part, rows in joint.systematic(self.point).items()}
         film = joint.film(self.point.x)
         self.film, self.material = film, replace(film, branches=())
-        self.forces = joint.solve(self.point.x, fine=True)
+        self.forces = joint.solve(self.point.x)
 
     # --- forces
 
@@ -249,7 +252,7 @@ class _Found:
         for k, one in enumerate(self.film.branches):
             units = np.eye(x.size)[[n + k, n + count + k]]
             ratio, log_time = (math.hypot(*self.budget(unit).values()) for unit in units)
-            found.append(FoundBranch.judged(one.ratio, ratio, one.time, log_time, self.joint.window()))
+            found.append(FoundBranch.judged(one.ratio, ratio, one.time, log_time, self.joint.window))
         return tuple(sorted(found, key=lambda one: one.time))
 
     def softening(self) -> tuple[Softening, ...]:
@@ -358,7 +361,7 @@ class _Found:
         return found
 
     def _spectrum(self, base: Identification) -> Spectrum:
-        low, high = self.joint.window()
+        low, high = self.joint.window
         alone = unseen(self.joint, self.point, self.scale, alone=True)
         slow, quick = blind_times(((one.time, one.shows_from) for one in alone), high)
         rest = float(np.mean([record.errors.specimen.prestretch for record in self.joint.records]))
@@ -372,6 +375,7 @@ class _Found:
             quick=quick,
             traces=self.traces(),
             softening=self.softening() if self.joint.soften else (),
+            left_out=1.0 - float(self.joint.kept.mean()),
         )
 
 

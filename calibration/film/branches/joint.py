@@ -1,8 +1,8 @@
 """Law, permittivity and branches of a film together with the errors of the rig: residuals over whole histories.
 
 Residuals are those of mean forces (`record`), weighted by their noise and its correlation. The model is the exact one
-where it was last solved, and moves from there as the response to first order in the ratios does (`response`): what is
-left to correct is a small part of the branches' force, and two or three exact solutions bring the fit to its end.
+where it was last solved, with its slopes, and bends from there as the response to first order in the ratios does
+(`response`): one or two exact solutions bring a fit to its end.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calibration.film.curve import Curve
 from calibration.film.differences import DIMENSIONS, common, contrast_weights
 from calibration.film.systematic import SYSTEMATIC, stiffening
 from model.material.materials import Material
-from model.membrane.history import solve_histories
+from model.membrane.history import History, solve_histories
 from model.membrane.solve import Status
 
 Array = NDArray[np.float64]
@@ -32,10 +32,11 @@ MOST_RATIO = 20.0
 TOLERANCE = 1e-4  # of the exact solution, of the peak
 NUMERICAL = 3e-5  # of the peak: error of the model and of the means that no sample's noise explains
 LONG = 20  # samples of a bin from which its noise tells correlations
-INNER, OUTER = 12, 4  # steps of Newton's method between exact solutions; exact solutions at most
-SETTLED = 0.05  # decrease of chi-square that is none
+INNER, OUTER = 12, 6  # steps of Newton's method between exact solutions; exact solutions at most
+SETTLED, RELATIVE = 0.05, 3e-4  # decrease of chi-square that is none; the same over chi-square
+ENOUGH = 0.3  # decrease of chi-square by a step after which the exact model is not solved again
 LOST = 1e6  # residual where the film has no state
-LEAST_KEPT = 0.5  # of the bins: a film that is taut at fewer is no film of this record
+LEAST_KEPT = 0.1  # of the bins: a film that is taut at fewer is no film of this record
 SOFTENING, SOFTENS = "softening", 0.05  # by how much a film softens in its first cycle; in the k-th by 1/k of it
 
 
@@ -66,6 +67,21 @@ class Point:
         return float(self.residual @ self.residual)
 
 
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What the exact solution at ``at`` (film and branches) has more than the response, of every record.
+
+    force : (bins,), N; slope : (bins, film and branches)
+    """
+
+    at: Array
+    force: list[Array]
+    slope: list[Array]
+
+
+State = tuple[Correction, list[Around], NDArray[np.bool_], NDArray[np.bool_]]
+
+
 class Joint:
     """All records of one film, with a number of branches."""
 
@@ -87,21 +103,27 @@ class Joint:
         self.force = np.concatenate([one.force for one in self.bins])
         self.sigma, self.excess, self.correlation_time = self._weights(start)
         self.nuisances = self._nuisances()
-        self.correction: list[Array] = [np.zeros(one.time.size) for one in self.bins]
-        self.kept = np.ones(self.force.size, dtype=np.bool_)  # bins at which the film is taut, as far as is known
+        nothing = [np.zeros(one.time.size) for one in self.bins]
+        self.correction = Correction(np.zeros(0), nothing, [one[:, None] for one in nothing])
+        self.kept = np.ones(self.force.size, dtype=np.bool_)  # bins at which the film is taut where it was last solved
+        self.within = self.kept  # bins that may be kept: others are left out of this fit, because another needs it
         self.soften = False  # whether a softening of every cycle is fitted along
         self.around: list[Around] = []
         self.solved = 0  # exact histories
 
     @property
-    def data(self) -> int:
-        """How many bins are held against the model."""
-        return int(self.kept.sum())
+    def independent(self) -> float:
+        """How many samples are held against the model, as those count that are independent."""
+        return int(np.concatenate([one.size for one in self.bins])[self.kept].sum()) / self.correlation_time
 
     @property
-    def samples(self) -> int:
-        """How many samples these are of."""
-        return int(np.concatenate([one.size for one in self.bins])[self.kept].sum())
+    def stretches(self) -> NDArray[np.intp]:
+        """Which stretch between bends of which record every bin is of; -1 where it is left out."""
+        first, found = 0, []
+        for one in self.bins:
+            found.append(one.segment + first)
+            first += one.record.history[0].size
+        return np.where(self.kept, np.concatenate(found), -1)
 
     # --- noise
 
@@ -173,6 +195,7 @@ class Joint:
         n, k = len(self.coordinates.names), self.count(x)
         return with_branches(self.coordinates.film(x), x[n : n + k], np.exp(x[n + k : n + 2 * k]))
 
+    @property
     def window(self) -> tuple[float, float]:
         """Shortest and longest relaxation time (s) that is looked for: two samples, and the length of the record."""
         return 2.0 * min(one.period for one in self.records), max(one.span for one in self.records)
@@ -181,7 +204,7 @@ class Joint:
         """Of a vector."""
         low, high = self.coordinates.bounds(x)
         k, errors = self.count(x), len(self.nuisances)
-        shortest, longest = (math.log(one) for one in self.window())
+        shortest, longest = (math.log(one) for one in self.window)
         low = np.concatenate((low, np.zeros(k), np.full(k, shortest), np.full(errors, -np.inf)))
         return low, np.concatenate((high, np.full(k, MOST_RATIO), np.full(k, longest), np.full(errors, np.inf)))
 
@@ -196,13 +219,13 @@ class Joint:
     # --- residuals
 
     @property
-    def state(self) -> tuple[list[Array], list[Around]]:
-        """What the model was last corrected by: to be set again where another start led nowhere."""
-        return [one.copy() for one in self.correction], self.around
+    def state(self) -> State:
+        """What the model was last corrected by: to be set again for another fit."""
+        return self.correction, self.around, self.kept, self.within
 
     @state.setter
-    def state(self, to: tuple[list[Array], list[Around]]) -> None:
-        self.correction, self.around = to
+    def state(self, to: State) -> None:
+        self.correction, self.around, self.kept, self.within = to
 
     def settle(self, x: Array) -> None:
         """Take what changes little (`response.Around`) from the film at ``x``."""
@@ -211,36 +234,36 @@ class Joint:
 
     def evaluate(self, x: Array) -> Point:
         """Residuals and slopes at ``x``, the model as corrected by the last exact solution."""
-        film = self.film(x)
+        film, own = self.film(x), len(self.coordinates.names) + 2 * self.count(x)
         slopes = [one.slopes(film, around) for one, around in zip(self.responses, self.around, strict=True)]
         columns, forces = [], []
-        errors = x[len(self.coordinates.names) + 2 * self.count(x) :]
         for number, (one, record) in enumerate(zip(slopes, self.records, strict=True)):
-            column = self._columns(x, one, number, record)
-            add = column[:, column.shape[1] - len(self.nuisances) :] @ errors
-            columns.append(column)
-            forces.append(one.force + self.correction[number] + add)
+            force = one.force + self.correction.force[number]
+            column = self._own_columns(x, one)
+            if self.correction.at.size == own:
+                force = force + self.correction.slope[number] @ (x[:own] - self.correction.at)
+                column = column + self.correction.slope[number]
+            errors = [each.prior * self._by_nuisance(each, one, force, number, record) for each in self.nuisances]
+            others = np.array(errors).reshape(-1, force.size).T
+            columns.append(np.concatenate((column, others), axis=1))
+            forces.append(force + others @ x[own:])
         force = np.concatenate(forces)
-        residual = np.concatenate(((force - self.force) / self.sigma, errors))
+        residual = np.concatenate(((force - self.force) / self.sigma, x[own:]))
         lost = ~np.isfinite(residual)
         residual[lost] = LOST
         residual[: self.kept.size][~self.kept] = 0.0
         jacobian = np.concatenate(columns) / self.sigma[:, None]
-        prior = np.eye(len(self.nuisances), x.size, x.size - len(self.nuisances))
+        prior = np.eye(len(self.nuisances), x.size, own)
         jacobian = np.where(np.isfinite(jacobian) & self.kept[:, None], jacobian, 0.0)
         return Point(x, residual, np.concatenate((jacobian, prior)), slopes)
 
-    def _columns(self, x: Array, one: Slopes, number: int, record: Record) -> Array:
-        """Derivatives of the force (N) of a record's bins by ``x``."""
-        moduli = self.coordinates.moduli
-        eps = one.relaxed["eps_r"]
+    def _own_columns(self, x: Array, one: Slopes) -> Array:
+        """Derivatives of the force (N) of a record's bins by film and branches."""
+        moduli, eps = self.coordinates.moduli, one.relaxed["eps_r"]
         film = self.coordinates.by_parameters(x[None], one.film[:, :moduli], one.film[:, moduli:], eps)
-        parts = [film, one.ratio, one.log_time]
-        for nuisance in self.nuisances:
-            parts.append(nuisance.prior * self._by_nuisance(nuisance, one, number, record)[:, None])
-        return np.concatenate(parts, axis=1)
+        return np.concatenate((film, one.ratio, one.log_time), axis=1)
 
-    def _by_nuisance(self, nuisance: Nuisance, one: Slopes, number: int, record: Record) -> Array:
+    def _by_nuisance(self, nuisance: Nuisance, one: Slopes, force: Array, number: int, record: Record) -> Array:
         bins = self.bins[number]
         mine = 1.0 if nuisance.run in (record.run, "the rig") else 0.0
         if nuisance.kind in DIMENSIONS:
@@ -250,7 +273,7 @@ class Joint:
         if nuisance.kind == SOFTENING:
             run, _, cycle = nuisance.run.rpartition(", cycle ")
             softer = record.cycle[bins.segment] >= int(cycle) - 1
-            return -one.force * softer * (run == record.run)
+            return -force * softer * (run == record.run)
         if nuisance.kind == "force_zero":
             return np.full(bins.time.size, mine)
         # A move later or farther is answered by the film as stiff as it is at once.
@@ -258,7 +281,7 @@ class Joint:
         if nuisance.kind == "displacement_zero":
             return mine * one.relaxed["h"]
         if nuisance.kind == "compliance":
-            return -one.force * one.relaxed["h"]
+            return -force * one.relaxed["h"]
         t, h, _ = record.history
         speed = (np.diff(h) / np.diff(t))[bins.segment]
         return -mine * stiff * speed
@@ -271,17 +294,41 @@ class Joint:
         found: Array = 2.0 * np.maximum(extra, 0.0) / h
         return found
 
-    def exact(self, x: Array, point: Point) -> bool:
-        """Correct the model by the exact solution at ``x``; whether bins were left out where the film is not taut."""
-        forces = self.solve(x)
+    def exact(self, point: Point) -> None:
+        """Correct the model by the exact solution at a point; bins at which the film is not taut are left out."""
+        forces, slopes = self._exact(point)
         known = [np.isfinite(force) for force in forces]
-        for k, (one, force) in enumerate(zip(point.slopes, forces, strict=True)):
-            self.correction[k] = np.where(known[k], force - one.force, 0.0)
-        kept = self.kept & np.concatenate(known)
-        fewer = LEAST_KEPT * self.kept.size <= kept.sum() < self.kept.sum()
-        if fewer:
+        own = len(self.coordinates.names) + 2 * self.count(point.x)
+        more, tilt = [], []
+        for one, force, slope, there in zip(point.slopes, forces, slopes, known, strict=True):
+            more.append(np.where(there, force - one.force, 0.0))
+            change = slope - self._own_columns(point.x, one)
+            tilt.append(np.where(there[:, None] & np.isfinite(change), change, 0.0))
+        self.correction = Correction(point.x[:own].copy(), more, tilt)
+        kept = self.within & np.concatenate(known)
+        if kept.sum() >= LEAST_KEPT * self.kept.size and not np.array_equal(kept, self.kept):
             self.kept = kept
-        return bool(fewer)
+
+    def _exact(self, point: Point) -> tuple[list[Array], list[Array]]:
+        """Exact forces (N) at the bins of every record, and their derivatives by film and branches."""
+        film = self.film(point.x)
+        if not film.branches:
+            forces = [one.elastic(film, one.bins.time) for one in self.responses]
+            return forces, [self._own_columns(point.x, one) for one in point.slopes]
+        forces, slopes = [], []
+        for one in self._histories(film, [one.bins.time for one in self.responses], sensitivities=True):
+            by = one.dforce or {}
+            columns = self.coordinates.by_parameters(point.x[None], by["mu"], by["alpha"], by["eps_r"])
+            by_log_time = by["time"] * [branch.time for branch in film.branches]
+            forces.append(np.where(one.status == Status.TAUT, one.force, np.nan))
+            slopes.append(np.concatenate((columns, by["ratio"], by_log_time), axis=1))
+        return forces, slopes
+
+    def _histories(self, film: Material, times: Sequence[Array], *, sensitivities: bool) -> list[History]:
+        self.solved += 1
+        specimens = [one.film(film) for one in self.responses]
+        histories = [(one.t, one.h, one.voltage, at) for one, at in zip(self.responses, times, strict=True)]
+        return solve_histories(specimens, histories, tolerance=TOLERANCE, sensitivities=sensitivities)
 
     def softening(self, x: Array, record: Record, times: Array) -> Array:
         """Share of the force that the film has lost by the cycles before, at times (s) of a record."""
@@ -293,16 +340,12 @@ class Joint:
                 found += size * one.prior * (cycle >= int(number) - 1)
         return found
 
-    def solve(self, x: Array, *, fine: bool = False) -> list[Array]:
-        """Exact forces (N) of every record at its bins, or at its fine times; NaN where the film is not taut."""
-        film = self.film(x)
-        at = [one.fine if fine else one.bins.time for one in self.responses]
-        self.solved += 1
+    def solve(self, x: Array) -> list[Array]:
+        """Exact forces (N) of every record at its fine times; NaN where the film is not taut."""
+        film, times = self.film(x), [one.fine for one in self.responses]
         if not film.branches:
-            return [one.elastic(film, times) for one, times in zip(self.responses, at, strict=True)]
-        specimens = [one.film(film) for one in self.responses]
-        histories = [(one.t, one.h, one.voltage, times) for one, times in zip(self.responses, at, strict=True)]
-        found = solve_histories(specimens, histories, tolerance=TOLERANCE)
+            return [one.elastic(film, at) for one, at in zip(self.responses, times, strict=True)]
+        found = self._histories(film, times, sensitivities=False)
         return [np.where(one.status == Status.TAUT, one.force, np.nan) for one in found]
 
     def systematic(self, point: Point) -> dict[str, Array]:
@@ -323,9 +366,8 @@ class Joint:
 
     # --- minimisation
 
-    def minimise(self, x: Array) -> Point:
-        """The minimum near ``x`` of the model as it is corrected (Levenberg & Marquardt, within bounds)."""
-        here = self.evaluate(x)
+    def minimise(self, here: Point) -> Point:
+        """The minimum near a point of the model as it is corrected (Levenberg & Marquardt, within bounds)."""
         damping = 1e-4
         for _ in range(INNER):
             low, high = self.bounds(here.x)
@@ -350,19 +392,26 @@ class Joint:
             if better is None:
                 break
             gain, here = here.cost - better.cost, better
-            if gain < SETTLED:
+            if gain < max(SETTLED, RELATIVE * here.cost):
                 break
         return here
 
     def fit(self, x: Array) -> Point:
         """The minimum near ``x`` of the exact model."""
         self.settle(x)
-        here = self.minimise(x)
+        here = self.minimise(self.evaluate(x))
+        self.settle(here.x)
+        here = self.evaluate(here.x)
         for _ in range(OUTER):
-            self.settle(here.x)
-            self.exact(here.x, self.evaluate(here.x))
+            kept = self.kept
+            self.exact(here)
             before = self.evaluate(here.x)
-            here = self.minimise(here.x)
-            if before.cost - here.cost < SETTLED:
+            here = self.minimise(before)
+            if self.kept is kept and before.cost - here.cost < max(ENOUGH, RELATIVE * here.cost):
                 break
         return here
+
+    def fewer(self, here: Point, kept: NDArray[np.bool_]) -> Point:
+        """The minimum near one that was found, with the bins that are ``kept`` alone."""
+        self.kept = self.within = kept
+        return self.minimise(self.evaluate(here.x))

@@ -9,6 +9,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,16 +142,18 @@ def _apart(t: Array, at: NDArray[np.intp], least: float) -> NDArray[np.intp]:
 
 def _pruned(t: Array, knots: Array, values: Sequence[Array], allowed: list[float]) -> Array:
     """Knots without those at which the polygons of all values bend by less than is ``allowed``."""
+    stretches = [Stretches.of(t, one, knots) for one in values]
     while knots.size > 2:
-        found = [through(t, one, knots) for one in values]
         share = np.diff(knots)[:-1] / (knots[2:] - knots[:-2])
         bend = np.zeros(knots.size - 2)
-        for one, most in zip(found, allowed, strict=True):
-            bend = np.maximum(bend, np.abs(one[1:-1] - one[:-2] - share * (one[2:] - one[:-2])) / most)
+        for one, most in zip(stretches, allowed, strict=True):
+            found = one.polygon(knots)
+            bend = np.maximum(bend, np.abs(found[1:-1] - found[:-2] - share * (found[2:] - found[:-2])) / most)
         least = int(bend.argmin())
         if bend[least] >= 1.0:
             break
         knots = np.delete(knots, least + 1)
+        stretches = [one.without(least + 1) for one in stretches]
     return knots
 
 
@@ -184,16 +188,70 @@ def _sharpened(t: Array, knots: Array, values: Sequence[Array], allowed: list[fl
 
 def through(t: Array, values: Array, knots: Array) -> Array:
     """Values at the knots of the polygon nearest to all values (least squares)."""
-    from scipy.linalg import solveh_banded
+    return Stretches.of(t, values, knots).polygon(knots)
 
-    place = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
-    share = (t - knots[place]) / (knots[place + 1] - knots[place])
-    n = knots.size
-    own = np.bincount(place, (1.0 - share) ** 2, n) + np.bincount(place + 1, share**2, n)
-    beside = np.bincount(place, share * (1.0 - share), n)[: n - 1]
-    right = np.bincount(place, (1.0 - share) * values, n) + np.bincount(place + 1, share * values, n)
-    weak = 1e-6 * float(own.max())  # a stretch of a few samples keeps the readings at its ends
-    band = np.zeros((2, n))
-    band[0, 1:], band[1] = beside, own + weak
-    found: Array = solveh_banded(band, right + weak * np.interp(knots, t, values))
-    return found
+
+@dataclass(frozen=True, eq=False)
+class Stretches:
+    """What a polygon needs of the samples of every stretch between its knots, about their means (Chan et al. 1983).
+
+    count : samples; t, value : their means; wide, tilt : sums of the squares of the times about their mean, and of
+    their products with the values; reading : the value at every knot
+    """
+
+    count: Array
+    t: Array
+    value: Array
+    wide: Array
+    tilt: Array
+    reading: Array
+
+    @classmethod
+    def of(cls, t: Array, values: Array, knots: Array) -> Self:
+        """From the samples."""
+        n = knots.size - 1
+        place = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, n - 1)
+        count = np.bincount(place, minlength=n).astype(float)
+        some = np.maximum(count, 1.0)
+        mean, level = np.bincount(place, t, n) / some, np.bincount(place, values, n) / some
+        off = t - mean[place]
+        wide: Array = np.bincount(place, off * off, n)
+        tilt: Array = np.bincount(place, off * values, n)
+        return cls(count, mean, level, wide, tilt, np.interp(knots, t, values))
+
+    def without(self, knot: int) -> Self:
+        """The same samples with one knot less."""
+        k = slice(knot - 1, knot + 1)
+        count, total = self.count[k], max(float(self.count[k].sum()), 1.0)
+        between = float(count.prod()) / total
+        apart = float(self.t[knot] - self.t[knot - 1]), float(self.value[knot] - self.value[knot - 1])
+
+        def joined(values: Array, one: float) -> Array:
+            return np.concatenate((values[: knot - 1], [one], values[knot + 1 :]))
+
+        return type(self)(
+            joined(self.count, float(count.sum())),
+            joined(self.t, float(count @ self.t[k]) / total),
+            joined(self.value, float(count @ self.value[k]) / total),
+            joined(self.wide, float(self.wide[k].sum()) + between * apart[0] ** 2),
+            joined(self.tilt, float(self.tilt[k].sum()) + between * apart[0] * apart[1]),
+            np.delete(self.reading, knot),
+        )
+
+    def polygon(self, knots: Array) -> Array:
+        """Values at the knots, with least squares."""
+        from scipy.linalg import solveh_banded
+
+        length = np.diff(knots)
+        share = (self.t - knots[:-1]) / length  # of a stretch, at the mean of its samples
+        wide, tilt = self.wide / length**2, self.tilt / length
+        n = knots.size
+        own, right, band = np.zeros(n), np.zeros(n), np.zeros((2, n))
+        own[:-1] = self.count * (1.0 - share) ** 2 + wide
+        own[1:] += self.count * share**2 + wide
+        right[:-1] = self.count * (1.0 - share) * self.value - tilt
+        right[1:] += self.count * share * self.value + tilt
+        weak = 1e-6 * float(own.max())  # a stretch of a few samples keeps the readings at its ends
+        band[0, 1:], band[1] = self.count * share * (1.0 - share) - wide, own + weak
+        found: Array = solveh_banded(band, right + weak * self.reading)
+        return found

@@ -188,3 +188,10 @@ def records_of_curves(curves: Sequence[Curve]) -> list[Record]:
         whole = replace(mine[0], label=run, **columns)
         found.append(record_of(whole, -math.inf, math.inf))
     return found
+
+
+def thinned(curve: Curve, most: int) -> Curve:
+    """The curve with every n-th of its samples, about so many."""
+    step = max(1, curve.h.size // most)
+    columns: dict[str, Any] = {name: getattr(curve, name) for name in _COLUMNS}
+    return replace(curve, **{name: None if one is None else one[::step] for name, one in columns.items()})

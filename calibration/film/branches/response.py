@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +28,12 @@ from model.specimen import Specimen
 Array = NDArray[np.float64]
 
 GRID, LEVELS = 25, (0.0, 0.7, 1.0)  # displacements, and voltages over the largest, at which the relaxed film is solved
-POINTS = 31  # along the radius
+POINTS = 15  # along the radius
 FINE = 10  # steps of time in a stretch of the history
 SIZES = ("disk_radius", "prestretch", "h")  # relative changes that others follow from
 STEP = 0.02  # relative change of a parameter for a slope
+NEAR = 0.05  # change of a film's law, over which its motion is solved anew: it hardly depends on the law
+NEVER_ZERO = 1e-40  # strain: one that decays in a hold to less becomes a number that processors are slow with
 
 
 class Relaxed:
@@ -97,54 +100,107 @@ class Motion:
     """
 
     def __init__(self, specimen: Specimen, h: Array, voltage: Array) -> None:
-        grid = np.linspace(0.0, 1.02 * float(h.max()), GRID)
+        self._follow(_Stretched.of([specimen], h, voltage)[0], h, voltage)
+
+    @classmethod
+    def of(cls, specimens: Sequence[Specimen], h: Array, voltage: Array, more: float) -> list[Self]:
+        """Those of several films, and that of the first one with all displacements larger by the share ``more``."""
+        stretched = _Stretched.of(specimens, h, voltage)
+        found = []
+        for one, places in [*((film, h) for film in stretched), (stretched[0], h * (1.0 + more))]:
+            motion = cls.__new__(cls)
+            motion._follow(one, places, voltage)
+            found.append(motion)
+        return found
+
+    def _follow(self, film: _Stretched, h: Array, voltage: Array) -> None:
         top = float(voltage.max())
-        levels = (0.0, 1.0) if top > 0.0 else (0.0,)
         share = (voltage / top) ** 2 if top > 0.0 else np.zeros(h.size)
         self.u, self.by_h = np.zeros((2, h.size, 2, POINTS))
-        for level in levels:
-            found = profiles(specimen, grid, level * top, POINTS, tolerance=1e-5)
-            logs = np.log(np.stack((found.stretch_1, found.stretch_2), axis=1))
-            known = np.isfinite(logs).all(axis=(1, 2))
-            if known.sum() > 1:  # else the film has no states at the highest voltage: those at 0 V, as a start
-                spline, last, radius = CubicSpline(grid[known], logs[known]), grid[known][-1], found.R[0]
+        for spline, last, level in zip(film.splines, film.last, film.levels, strict=True):
             part = (share if level else 1.0 - share)[:, None, None]
             inside = np.minimum(h, last)
             self.u += part * spline(inside)
             self.by_h += part * spline(inside, 1)
+        self.weight = film.weight
+
+    def forces(self, film: Material, t: Array, times: Sequence[float] | Array) -> Array:
+        """What branches as stiff as the film add to the force (N), (times, len(t))."""
+        return forces_of([self], [film], t, times)[0]
+
+
+class _Stretched:
+    """Logarithmic stretches of one relaxed film over displacement, at 0 V and at the largest voltage.
+
+    splines, last : of every level, and the largest displacement that it is good for (m)
+    """
+
+    def __init__(self, specimen: Specimen, grid: Array, levels: Sequence[float], logs: Array) -> None:
+        self.levels = levels
+        self.splines: list[CubicSpline] = []
+        self.last: list[float] = []
+        for level in logs:
+            known = np.isfinite(level).all(axis=(1, 2))
+            if known.sum() > 1:
+                self.splines.append(CubicSpline(grid[known], level[known]))
+                self.last.append(float(grid[known][-1]))
+            else:  # the film has no states at the highest voltage: those at 0 V, as a start
+                self.splines.append(self.splines[-1])
+                self.last.append(self.last[-1])
         simpson = np.ones(POINTS)
         simpson[1:-1:2], simpson[2:-1:2] = 4.0, 2.0
         step = math.log(specimen.ring_radius / specimen.disk_radius) / (POINTS - 1) / 3.0
         volume = 2.0 * math.pi * specimen.thickness / specimen.prestretch**2 * step
-        self.weight = volume * simpson * radius**2
+        self.weight = volume * simpson * np.geomspace(specimen.disk_radius, specimen.ring_radius, POINTS) ** 2
 
-    def forces(self, film: Material, t: Array, times: Sequence[float] | Array) -> Array:
-        """What branches as stiff as the film add to the force (N), (times, len(t)); exponential rule of order 2."""
-        law = film.law(np.array(film.mu)[:, None], np.array(film.alpha).reshape(-1, 1))
-        modulus, tau = film.shear_modulus, np.asarray(times, dtype=float)[:, None]
-        w = np.zeros((2, tau.size, POINTS))
-        found = np.zeros((tau.size, t.size))
-        change, x = np.diff(self.u, axis=0), np.diff(t) / tau
-        decay, share = np.exp(-x), -np.expm1(-x) / x
-        drive = self.by_h * self.weight
+    @classmethod
+    def of(cls, specimens: Sequence[Specimen], h: Array, voltage: Array) -> list[Self]:
+        """Those of films that are driven alike, solved together."""
+        grid = np.linspace(0.0, (1.0 + STEP) * float(h.max()), GRID)
+        top = float(voltage.max())
+        levels = (0.0, top) if top > 0.0 else (0.0,)
+        films = np.empty((len(specimens), 1, 1), dtype=np.object_)
+        films[:, 0, 0] = specimens
+        found = profiles(films, grid, np.array(levels)[:, None], POINTS, tolerance=1e-5)
+        logs = np.log(np.stack((found.stretch_1, found.stretch_2), axis=1))
+        logs = logs.reshape(len(specimens), len(levels), GRID, 2, POINTS)
+        return [cls(one, grid, levels, mine) for one, mine in zip(specimens, logs, strict=True)]
 
-        def stress(at: Array) -> tuple[Array, Array]:
-            s1, s2, *_ = law.derivatives(stack(at[0], at[1]))
-            return s1, s2
 
-        s1, s2 = stress(w)
-        for k in range(t.size - 1):
-            e, p = decay[:, k, None], share[:, k, None]
-            free = e * w + p * change[k][:, None]
-            pull = p * x[:, k, None]
-            more = np.array((2.0 * s1 - s2, 2.0 * s2 - s1)) / (6.0 * modulus) - w
-            ahead = free - pull * more
-            t1, t2 = stress(ahead)
-            late = np.array((2.0 * t1 - t2, 2.0 * t2 - t1)) / (6.0 * modulus) - ahead
-            w = free - 0.5 * pull * (more + late)
-            s1, s2 = stress(w)
-            found[:, k + 1] = s1 @ drive[k + 1, 0] + s2 @ drive[k + 1, 1]
-        return found
+def forces_of(motions: Sequence[Motion], films: Sequence[Material], t: Array, times: Sequence[float] | Array) -> Array:
+    """What branches as stiff as each film add to its force (N), (films, times, len(t)); exponential rule of order 2.
+
+    Films of one law that move each in its way, with branches of the same ``times`` (s).
+    """
+    count, many = len(films), len(times)
+    which = np.repeat(np.arange(count), many)
+    mu, alpha = (np.array([getattr(one, name) for one in films]).reshape(count, -1).T for name in ("mu", "alpha"))
+    law = films[0].law(mu[:, which], alpha[:, which]) if count > 1 else films[0].law(mu, alpha)
+    modulus = np.array([one.shear_modulus for one in films])[which]
+    tau = np.tile(np.asarray(times, dtype=float), count)
+    change = np.stack([np.diff(one.u, axis=0) for one in motions], axis=-1)[..., which] + NEVER_ZERO
+    drive = np.stack([one.by_h * one.weight for one in motions], axis=-1)
+    x = np.diff(t)[:, None] / tau
+    decay, share = np.exp(-x), -np.expm1(-x) / x
+    half = 0.5 * share * x
+    sheared = 1.0 / (6.0 * modulus)
+    w = np.zeros((2, POINTS, tau.size))
+    stress = np.empty((t.size, *w.shape))
+
+    def excess(at: Array, out: Array) -> Array:
+        out[0], out[1], *_ = law.derivatives(stack(at[0], at[1]))
+        found: Array = (2.0 * out - out[::-1]) * sheared
+        return found - at
+
+    more = excess(w, stress[0])
+    ahead = np.empty_like(w)
+    for k in range(t.size - 1):
+        free = decay[k] * w + share[k] * change[k]
+        late = excess(free - 2.0 * half[k] * more, ahead)
+        w = free - half[k] * (more + late)
+        more = excess(w, stress[k + 1])
+    found: Array = np.einsum("tipvs,tipv->vst", stress.reshape(t.size, 2, POINTS, count, many), drive)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +250,7 @@ class Response:
         self.fine_v = np.interp(self.fine, self.t, self.voltage)
         self.at = np.searchsorted(self.fine, bins.time)
         self.highest = float(self.h.max())
+        self._solved: tuple[Array, list[Motion]] | None = None
 
     def film(self, material: Material) -> Specimen:
         """The specimen of that material."""
@@ -205,42 +262,41 @@ class Response:
         h, v = np.interp(times, self.t, self.h), np.interp(times, self.t, self.voltage)
         return solve_many(plain, h, v, tolerance=1e-6).force
 
-    def motion(self, film: Specimen) -> Motion:
-        """The relaxed film's motion along the record."""
-        return Motion(film.with_material(replace(film.material, branches=())), self.fine_h, self.fine_v)
+    def motions(self, material: Material) -> list[Motion]:
+        """The relaxed film's motion along the record, with each of `SIZES` larger by `STEP`, and its own at last.
+
+        Those of a film that is near are taken again.
+        """
+        law = _kind(material)
+        if self._solved is None or not float(np.abs(law - self._solved[0]).max()) <= NEAR:
+            plain = replace(material, branches=())
+            sizes = [name for name in SIZES if name != "h"]
+            larger = [replace(self.specimen, **{name: getattr(self.specimen, name) * (1.0 + STEP)}) for name in sizes]
+            films = [one.with_material(plain) for one in (self.specimen, *larger)]
+            own, *others = Motion.of(films, self.fine_h, self.fine_v, STEP)
+            self._solved = law, [*others, own]
+        return self._solved[1]
 
     def added(self, material: Material, times: Sequence[float] | Array) -> Array:
         """What branches as stiff as the film add at the bins (N), (times, bins), to first order."""
-        return self.motion(self.film(material)).forces(material, self.fine, times)[:, self.at]
+        return self.motions(material)[-1].forces(material, self.fine, times)[:, self.at]
 
     def around(self, material: Material) -> Around:
         """What changes little near a film with its branches."""
         plain = replace(material, branches=())
         times = [one.time for one in material.branches]
-        motion = self.motion(self.film(plain))
+        numbers = len(plain.mu) + len(plain.alpha)
+        *others, motion = self.motions(plain)
         if not times:
-            count = len(plain.mu) + len(plain.alpha)
             nothing = np.zeros((0, self.at.size))
-            return Around(motion, [nothing] * count, dict.fromkeys(SIZES, nothing))
-
-        def forces(film: Material, other: Motion) -> Array:
-            found: Array = other.forces(film, self.fine, times)[:, self.at]
-            return found
-
-        own = forces(plain, motion)
-        by_number = []
-        for number in range(len(plain.mu) + len(plain.alpha)):
-            moved, step = _moved(plain, number)
-            by_number.append((forces(moved, motion) - own) / step)
-        by_size = {}
-        for name in SIZES:
-            if name == "h":
-                other = Motion(self.film(plain), self.fine_h * (1.0 + STEP), self.fine_v)
-            else:
-                changed = replace(self.specimen, **{name: getattr(self.specimen, name) * (1.0 + STEP)})
-                other = self.motion(changed.with_material(plain))
-            by_size[name] = (forces(plain, other) - own) / STEP
-        return Around(motion, by_number, by_size)
+            return Around(motion, [nothing] * numbers, dict.fromkeys(SIZES, nothing))
+        moved = [_moved(plain, number) for number in range(numbers)]
+        motions = [motion] * (1 + numbers) + others
+        films = [plain, *(film for film, _ in moved)] + [plain] * len(others)
+        own, *rest = forces_of(motions, films, self.fine, times)[..., self.at]
+        steps = [step for _, step in moved] + [STEP] * len(others)
+        changes = [(there - own) / step for there, step in zip(rest, steps, strict=True)]
+        return Around(motion, changes[:numbers], dict(zip(SIZES, changes[numbers:], strict=True)))
 
     def slopes(self, material: Material, around: Around) -> Slopes:
         """Force and derivatives at a film with its branches."""
@@ -269,6 +325,15 @@ class Response:
         found["ring_radius"] = total - found["disk_radius"] - found["h"]
         found["force"] = total
         return found
+
+
+def _kind(film: Material) -> Array:
+    """What of a film's law its motion depends on: shares of the moduli, shape parameters, permittivity by stiffness."""
+    mu = np.array(film.mu)
+    shares = mu / np.abs(mu).sum()
+    return np.concatenate(
+        (shares, np.log(np.maximum(np.abs(film.alpha), 1e-3)), [math.log(film.eps_r / film.shear_modulus)])
+    )
 
 
 def _moved(film: Material, number: int) -> tuple[Material, float]:

@@ -62,23 +62,29 @@ class BranchCount:
     held_out: float
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
-    """One run over time: mean forces (N) that were fitted, their deviations, and the model with and without branches.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OverTime:
+    """Means over time that were fitted (N or Pa), their deviations, and the model with and without branches.
 
-    ``segment`` numbers the stretches between bends of the history, of which ``moving`` says where the disk moved.
+    ``segment`` numbers the stretches between bends of the history, of which ``moving`` says where it moved.
     """
 
-    run: str
     time: Array
-    h: Array
-    voltage: Array
     measured: Array
     deviation: Array
     model: Array
     relaxed: Array
     segment: NDArray[np.intp]
     moving: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trace(OverTime):
+    """One run over time: forces (N) at displacements (m) and voltages (V)."""
+
+    run: str
+    h: Array
+    voltage: Array
 
 
 @dataclass(frozen=True)
@@ -118,6 +124,8 @@ class Spectrum:
     traces : tuple of Trace
     softening : tuple of Softening
         Of every cycle after the first, where the record shows that the film softens; else empty.
+    left_out : float
+        Share of the mean forces from which on the film hangs slack or is wrinkled: they took no part.
     """
 
     branches: tuple[FoundBranch, ...]
@@ -129,6 +137,7 @@ class Spectrum:
     quick: float
     traces: tuple[Trace, ...] = ()
     softening: tuple[Softening, ...] = ()
+    left_out: float = 0.0
 
     @property
     def sentences(self) -> list[str]:
@@ -148,6 +157,11 @@ class Spectrum:
             f"{100.0 * one.uncertainty:.1g} %; the law is that of the first one recorded"
             for one in self.softening
         ]
+        if self.left_out > 0.0:
+            words.append(
+                f"the film hangs slack or wrinkles on the way back: {100.0 * self.left_out:.0f} % of the mean forces "
+                "are left out, those of later cycles too; move back more slowly"
+            )
         if self.quick > 0.0:
             words.append(f"a branch of {self.quick:.2g} s would not show; move faster to see it")
         return words
@@ -174,6 +188,7 @@ class Spectrum:
             "hold_to_see_it_s": self.hold,
             "does_not_show_below_s": self.quick,
             "softening": [asdict(one) for one in self.softening],
+            "share_left_out": self.left_out,
             "sentences": self.sentences,
         }
 

@@ -9,14 +9,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.film.branches.counting import Count, free_columns, misfit
 from calibration.film.branches.result import HOLD, BranchCount, FoundBranch, Spectrum, blind_times
 from calibration.film.propagation import Covariance
 from calibration.film.result import Quantity, verdict
 from calibration.sheet.search import minima
 from calibration.sheet.sheet_tests import HomogeneousTest, TestsError
-from calibration.sheet.timed.count import Count, count_branches, free_columns, misfit, unseen
+from calibration.sheet.timed.count import count_branches, unseen
 from calibration.sheet.timed.predict import predict_sheets, trace_of
-from calibration.sheet.timed.problem import ZERO, TimedProblem
+from calibration.sheet.timed.problem import ZERO, Point, TimedProblem
 from calibration.sheet.timed.result import SheetTrace, TimedFit
 from calibration.sheet.timed.warnings import warnings_of
 from model.material.law import Law
@@ -73,7 +74,7 @@ def fit_timed(
 class _Found:
     """A fit at its end, and what follows from it."""
 
-    def __init__(self, problem: TimedProblem, tried: Sequence[Count], numerical: float) -> None:
+    def __init__(self, problem: TimedProblem, tried: Sequence[Count[Point]], numerical: float) -> None:
         self.problem, self.tried, self.numerical = problem, tried, numerical
         self.point = tried[-1].point
         self.scale = misfit(problem, self.point)

@@ -64,7 +64,9 @@ class TimedProblem:
         self.numbers = self.elastic.size
         self.largest = np.array([float(np.abs(one.stress).max()) for one in self.bins])
         self.sigma = np.concatenate([np.tile(one.sigma, len(one.directions)) for one in self.bins])
-        self.samples = sum(one.noise.size / one.correlated for one in self.bins)
+        self.independent = sum(one.noise.size / one.correlated for one in self.bins)
+        parts = [np.tile(one.segment, len(one.directions)) + 10_000 * k for k, one in enumerate(self.bins)]
+        self.stretches: NDArray[np.intp] = np.concatenate(parts)
         self.fine = FINE[0]
         self._lay()
         self.measured = np.concatenate([one.stress.ravel() for one in self.bins])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.result import Spectrum
+from calibration.film.branches.result import OverTime, Spectrum
 from calibration.film.propagation import secant
 from calibration.film.result import CONVENTION, Quantity, quantity_dict
 from model.material.law import Law
@@ -22,23 +22,13 @@ Array = NDArray[np.float64]
 NO_EPS = 1.0  # permittivity of a material that a sheet does not tell
 
 
-@dataclass(frozen=True, eq=False)
-class SheetTrace:
-    """One test over time: mean stresses (Pa) with their deviations, the model with and without branches.
-
-    ``segment`` numbers the stretches between bends of the history, of which ``moving`` says where the sheet moved.
-    """
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SheetTrace(OverTime):
+    """One test over time: nominal stresses (Pa)."""
 
     name: str
     kind: str
-    time: Array
     stretch: Array
-    measured: Array
-    deviation: Array
-    model: Array
-    relaxed: Array
-    segment: NDArray[np.intp]
-    moving: NDArray[np.bool_]
 
     @property
     def largest(self) -> float:

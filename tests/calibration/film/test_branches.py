@@ -12,13 +12,16 @@ import pytest
 
 from calibration.film.branches.estimate import with_elastic_error
 from calibration.film.branches.identify import identify_branches
+from calibration.film.branches.joint import Joint
+from calibration.film.branches.polygon import Stretches, through
 from calibration.film.branches.record import Record
 from calibration.film.branches.response import Motion, Relaxed
 from calibration.film.branches.result import FoundBranch, Spectrum
+from calibration.film.branches.spectrum import count_branches, covariance
 from calibration.film.curve import Curve
 from calibration.film.identify import identify
 from calibration.film.result import GOOD, Identification, Quantity
-from model.material.materials import NAMED, Material
+from model.material.materials import NAMED, Branch, Material
 from model.membrane.solution import Status
 from model.membrane.solve import solve
 from model.specimen import Specimen
@@ -65,6 +68,20 @@ def test_a_noisy_record_becomes_the_polygon_that_was_run() -> None:
         assert np.abs(knots - corner).min() < 0.06, corner
     assert np.interp(t, knots, high) == pytest.approx(np.interp(t, *corners), abs=6e-6)
     assert np.interp(t, knots, voltage) == pytest.approx(np.interp(t, corners[0], volts), abs=6.0)
+
+
+def test_a_polygon_of_merged_stretches_is_that_of_all_samples() -> None:
+    """A knot less changes two stretches; the polygon is the least-squares fit of hat functions to every sample."""
+    t = np.arange(500.0, 560.0, 0.01)
+    random = np.random.default_rng(5)
+    values = np.interp(t, [500.0, 512.0, 530.0, 560.0], [0.0, 12.0, 12.0, 1.0]) + 0.1 * random.standard_normal(t.size)
+    knots = t[[0, 300, 1200, 1230, 3000, 4000, t.size - 1]]
+    merged = Stretches.of(t, values, knots).without(3).without(1)
+    left = knots[[0, 2, 4, 5, 6]]
+    hats = np.stack([np.interp(t, left, one) for one in np.eye(left.size)], axis=1)
+    direct = np.linalg.lstsq(hats, values, rcond=None)[0]
+    assert merged.polygon(left) == pytest.approx(direct, abs=1e-4)
+    assert merged.polygon(left) == pytest.approx(through(t, values, left), abs=1e-9)
 
 
 def test_means_over_bins_have_no_bias_by_the_curvature_of_the_force() -> None:
@@ -198,6 +215,50 @@ def test_a_film_that_softens_and_relaxes_is_told_apart() -> None:
     (branch,) = found.spectrum.branches
     assert abs(branch.ratio - 0.2) < 3.0 * branch.ratio_uncertainty
     assert abs(math.log(branch.time / 8.0)) < 3.0 * branch.time_relative
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_fit_ends_where_the_exact_model_does_after_few_solutions() -> None:
+    """Cost is that of the exact solutions; one more of them moves the answer by a small part of its uncertainty."""
+    cone = ViscousCone(branches=((0.5, 0.8), (0.3, 12.0)), **ONE_TERM)
+    given = records(run(cone, paper((0.0, 1500.0), hold=30.0, speed=6e-3), 3, rate=50.0))
+    joint = Joint(given, Material("start", (2e4,), (5.0,), 2.0), 1)
+    tried = count_branches(joint, joint.vector(Material("start", (2e4,), (5.0,), 2.0)), None)
+    assert [one.branches for one in tried] == [0, 1, 2]
+    assert joint.solved <= 6
+    point = tried[-1].point
+    deviation = np.sqrt(np.diag(covariance(joint, point).matrix))
+    joint.exact(point)
+    further = joint.minimise(joint.evaluate(point.x))
+    free = joint.varied(point.x)
+    assert np.abs((further.x - point.x)[free]).max() < 1.0  # or `deviation` would be one of numbers that stand still
+    assert (np.abs(further.x - point.x)[free] < 0.25 * deviation[free]).all()
+    truth = joint.vector(
+        Material("truth", cone.mu, cone.alpha, cone.eps_r, branches=tuple(Branch(*one) for one in cone.branches))
+    )
+    quick = np.argsort(point.x[5:7])  # after a modulus, an exponent, eps_r and two ratios: the times
+    order = np.concatenate((np.arange(3), 3 + quick, 5 + quick))
+    assert np.abs((point.x[order] - truth[:7]) / deviation[order]).max() < 4.0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_film_that_is_slack_after_a_third_of_its_record_is_fitted_to_that_third() -> None:
+    """It is slack on its first way back, before any voltage: no permittivity, and the branch as good as the rest."""
+    cone = ViscousCone(branches=((1.04, 10.3),), **ONE_TERM)
+    curves = run(cone, paper((0.0, 1500.0), hold=60.0, speed=3e-3), 1, rate=50.0)
+    found, relaxed = identify_branches(records(curves), curves, terms=1)
+    assert found.spectrum is not None
+    assert found.spectrum.left_out > 0.5
+    assert any("move back more slowly" in one for one in found.warnings)
+    (branch,) = found.spectrum.branches
+    assert branch.verdict == "identified"
+    assert abs(branch.ratio - 1.04) < 3.0 * branch.ratio_uncertainty < 0.05
+    assert abs(math.log(branch.time / 10.3)) < 3.0 * branch.time_relative < 0.05
+    assert found.spectrum.counts[-1].held_out < 1.5
+    assert "eps_r" not in found.quantities
+    assert relaxed[1].flagged is not None and relaxed[1].flagged.all()
 
 
 @pytest.mark.slow

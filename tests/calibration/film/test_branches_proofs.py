@@ -1,9 +1,11 @@
 """Many experiments on a simulated film that takes time: what is stated of it holds as often as it should.
 
-They take hours: `pytest -m long tests/calibration/film/test_branches_proofs.py`; `test_branches` has a few.
+They take hours: `pytest -m long tests/calibration/film/test_branches_proofs.py`; `test_branches` has a few. With
+`DEA_RIG_EXPERIMENTS=20` there are fewer.
 """
 
 import math
+import os
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -17,7 +19,8 @@ from tests.calibration.film.viscous_cone import ViscousCone
 from tests.calibration.film.viscous_runs import ONE_TERM, paper, records, run
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(36_000)]
-EXPERIMENTS, COVERED, BEYOND = 200, 1.96, 4.0
+EXPERIMENTS = int(os.environ.get("DEA_RIG_EXPERIMENTS", "200"))
+COVERED, BEYOND = 1.96, 4.0
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
@@ -58,10 +61,12 @@ def test_coverage_of_films_with_one_to_three_branches() -> None:
         found, _ = identify_branches(records(curves), curves, terms=1)
         truth = Material("truth", cone.mu, cone.alpha, cone.eps_r)
         known = {"eps_r": cone.eps_r, "stiffness_fixed": secant_modulus(truth, *found.fixed_stretch)}
+        assert found.spectrum is not None
         for name, value in known.items():
+            if name == "eps_r" and found.spectrum.left_out > 0.0 and name not in found.quantities:
+                continue  # slack before the first voltage, and says so
             quantity = found.quantities[name]
             errors[name].append((quantity.value - value) / quantity.uncertainty)
-        assert found.spectrum is not None
         assert found.spectrum.softening == ()
         for one in found.spectrum.branches:
             if one.verdict == "identified":

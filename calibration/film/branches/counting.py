@@ -1,0 +1,184 @@
+"""How many branches there are, as far as data tell: criteria that are the same for films in cones and for sheets.
+
+A branch is searched for among many relaxation times, so it must explain more than its two numbers would by chance: AICc
+has to fall by `EARNED`, and what is left out has to be predicted no worse. That leaves one false branch in some hundred
+elastic films.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.film.branches.result import FAR
+
+Array = NDArray[np.float64]
+
+EARNED = 7.0  # by which AICc must fall for another branch
+PREDICTED = 1.02  # what is left out may be predicted worse by this factor at most
+MOST = 3  # branches that are looked for
+PER_DECADE = 4  # relaxation times that a search tries
+GROUPS = 8  # parts of the records that are left out in turn
+ALMOST_SURE = 1.6449  # standard deviations that 95 of 100 stay below
+DECADES_BEYOND = 1.3  # of the window, for branches that are not seen
+
+
+class Fitted(Protocol):
+    """A fit. The last residuals are those of the errors that are fitted along, the last numbers of x."""
+
+    @property
+    def x(self) -> Array:
+        """The numbers that are fitted."""
+
+    @property
+    def residual(self) -> Array:
+        """Of the data, then of the errors, over their standard deviations."""
+
+    @property
+    def jacobian(self) -> Array:
+        """Derivatives of the residuals by x."""
+
+    @property
+    def cost(self) -> float:
+        """Chi-square."""
+
+
+class Problem(Protocol):
+    """What has branches: a film in a cone or a sheet, with its records."""
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """Shortest and longest relaxation time (s) that is looked for."""
+
+    @property
+    def independent(self) -> float:
+        """How many samples are held against the model, as those count that are independent."""
+
+    @property
+    def stretches(self) -> NDArray[np.intp]:
+        """Which stretch of which record every residual of the data is of; -1 where it is left out."""
+
+    def count(self, x: Array) -> int:
+        """How many branches ``x`` has."""
+
+    def bounds(self, x: Array) -> tuple[Array, Array]:
+        """Limits of ``x``."""
+
+    def varied(self, x: Array) -> NDArray[np.bool_]:
+        """Entries of ``x`` that are fitted."""
+
+
+P = TypeVar("P", bound=Fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class Count(Generic[P]):
+    """A number of branches, fitted: AICc over its least, root mean square of what was left out over its noise."""
+
+    branches: int
+    point: P
+    aicc: float
+    held_out: float
+
+
+def free_columns(problem: Problem, point: Fitted) -> NDArray[np.bool_]:
+    """Entries of x that are fitted and at no bound."""
+    low, high = problem.bounds(point.x)
+    span = np.where(np.isfinite(high - low), high - low, 1.0)
+    inside = np.minimum(point.x - low, high - point.x) > 1e-6 * span
+    found: NDArray[np.bool_] = problem.varied(point.x) & inside
+    return found
+
+
+def numbers(problem: Problem, point: Fitted) -> int:
+    """How many numbers of film and branches were fitted."""
+    errors = point.residual.size - problem.stretches.size
+    return int(free_columns(problem, point)[: point.x.size - errors].sum())
+
+
+def misfit(problem: Problem, point: Fitted) -> float:
+    """Chi-square over its freedom where that is no chance, times how many bins err together; 1 where it is."""
+    stretches = problem.stretches
+    data = point.residual[: stretches.size][stretches >= 0]
+    freedom = max(1, data.size - numbers(problem, point))
+    ratio = float(data @ data) / freedom
+    if not ratio > 1.0 + 3.0 * math.sqrt(2.0 / freedom):
+        return 1.0
+    together = 1.0
+    for lag in range(1, data.size // 4):
+        rho = float(data[lag:] @ data[:-lag]) / float(data @ data)
+        if rho < 2.0 / math.sqrt(data.size):
+            break
+        together += 2.0 * rho
+    return ratio * together
+
+
+def aicc(problem: Problem, point: Fitted, scale: float) -> float:
+    """Of all samples, as those count that are independent; ``scale`` is the misfit of the richest model."""
+    fitted = numbers(problem, point)
+    crowding = 2.0 * fitted * (fitted + 1) / max(1.0, problem.independent - fitted - 1)
+    return point.cost / scale + 2.0 * fitted + crowding
+
+
+def held_out(problem: Problem, point: Fitted) -> float:
+    """Root mean square over noise of what a fit without it says of each part of the records (to first order)."""
+    columns, total = point.jacobian[:, free_columns(problem, point)], 0.0
+    stretches = problem.stretches
+    kept = stretches >= 0
+    order = np.unique(stretches[kept])
+    for mine in np.array_split(order, min(GROUPS, order.size)):
+        out = np.zeros(point.residual.size, dtype=np.bool_)
+        out[: stretches.size] = np.isin(stretches, mine)
+        step = np.linalg.lstsq(columns[~out], -point.residual[~out], rcond=1e-10)[0]
+        there = point.residual[out] + columns[out] @ step
+        total += float(there @ there)
+    return math.sqrt(total / int(kept.sum()))
+
+
+def pays(problem: Problem, fewer: Fitted, more: Fitted) -> tuple[float, bool]:
+    """The misfit of the richer fit, and whether its branch is earned."""
+    scale = misfit(problem, more)
+    earned = gain(problem, fewer, more, scale) > EARNED
+    return scale, earned and held_out(problem, more) < PREDICTED * held_out(problem, fewer)
+
+
+def gain(problem: Problem, fewer: Fitted, more: Fitted, scale: float) -> float:
+    """By how much AICc falls from one fit to the other."""
+    return aicc(problem, fewer, scale) - aicc(problem, more, scale)
+
+
+def counted(problem: Problem, points: Sequence[P], scale: float) -> list[Count[P]]:
+    """Fits with their criteria."""
+    criteria = [aicc(problem, one, scale) for one in points]
+    return [
+        Count(problem.count(one.x), one, value - min(criteria), held_out(problem, one))
+        for one, value in zip(points, criteria, strict=True)
+    ]
+
+
+def grid(problem: Problem, beyond: float) -> Array:
+    """Relaxation times (s) over the window and ``beyond`` it by so many decades."""
+    shortest, longest = problem.window
+    longest *= 10.0**beyond
+    return np.geomspace(shortest, longest, max(2, round(PER_DECADE * math.log10(longest / shortest)) + 1))
+
+
+def shows_from(point: Fitted, free: NDArray[np.bool_], rows: Array, scale: float) -> list[float]:
+    """From which ratio on a further branch would be found beside what is ``free``; inf where none that occurs would.
+
+    ``rows`` are what further branches of ratio one add to the residuals (branches, residuals).
+    """
+    u, s, _ = np.linalg.svd(point.jacobian[:, free], full_matrices=False)
+    base = u[:, s > 1e-10 * s[0]]
+    needed = (math.sqrt(EARNED + 4.0) + ALMOST_SURE) * math.sqrt(scale)
+    found = []
+    for one in rows:
+        visible = float(np.linalg.norm(one - base @ (base.T @ one)))
+        size = needed / visible if visible > 1e-3 * float(np.linalg.norm(one)) else math.inf
+        found.append(size if size <= FAR else math.inf)
+    return found
