@@ -215,8 +215,7 @@ class Stretches:
         some = np.maximum(count, 1.0)
         mean, level = np.bincount(place, t, n) / some, np.bincount(place, values, n) / some
         off = t - mean[place]
-        wide: Array = np.bincount(place, off * off, n)
-        tilt: Array = np.bincount(place, off * values, n)
+        wide, tilt = (np.bincount(place, one, n).astype(float) for one in (off * off, off * values))
         return cls(count, mean, level, wide, tilt, np.interp(knots, t, values))
 
     def without(self, knot: int) -> Self:

@@ -193,5 +193,6 @@ def records_of_curves(curves: Sequence[Curve]) -> list[Record]:
 def thinned(curve: Curve, most: int) -> Curve:
     """The curve with every n-th of its samples, about so many."""
     step = max(1, curve.h.size // most)
-    columns: dict[str, Any] = {name: getattr(curve, name) for name in _COLUMNS}
-    return replace(curve, **{name: None if one is None else one[::step] for name, one in columns.items()})
+    columns = {name: getattr(curve, name) for name in _COLUMNS}
+    fewer: dict[str, Any] = {name: None if one is None else one[::step] for name, one in columns.items()}
+    return replace(curve, **fewer)

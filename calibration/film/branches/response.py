@@ -126,7 +126,8 @@ class Motion:
 
     def forces(self, film: Material, t: Array, times: Sequence[float] | Array) -> Array:
         """What branches as stiff as the film add to the force (N), (times, len(t))."""
-        return forces_of([self], [film], t, times)[0]
+        found: Array = forces_of([self], [film], t, times)[0]
+        return found
 
 
 class _Stretched:

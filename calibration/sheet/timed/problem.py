@@ -26,6 +26,7 @@ MOST_RATIO = 20.0
 STEP = 1e-4  # relative change of a number for a slope
 FINE = (1, 2, 4, 8)  # steps of time from bin to bin, the first that is good enough
 GOOD = 0.1  # of the deviations: error of the steps of time
+MOST_STEPS, MOST_LAST = 20, 200  # of a search; the last one goes to its end however flat the valley is
 COARSE = 1e-3  # of the largest stress: an error of the steps of time that is told
 
 
@@ -242,7 +243,7 @@ class TimedProblem:
             ftol=1e-4 if last else 1e-3,
             xtol=1e-6 if last else 1e-4,
             gtol=None,
-            max_nfev=20,
+            max_nfev=MOST_LAST if last else MOST_STEPS,
         )
         x = start.copy()
         x[free] = found.x
