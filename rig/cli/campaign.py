@@ -27,6 +27,7 @@ def _running(function: Any) -> Any:
             click.option("--arm", is_flag=True, help="As for `dea-rig run`."),
             click.option("--yes", is_flag=True, help="Answer every question as expected: for simulated benches."),
             click.option("--take-down", is_flag=True, help="As for `dea-rig run`."),
+            click.option("--clear", is_flag=True, help="As for `dea-rig run`; holds for the first run."),
             click.option("--skip", multiple=True, metavar="NAME", help="Leave this specimen out this time."),
             click.option("--again", multiple=True, metavar="NAME", help="Do this one, which failed, once more."),
             click.option("--most", type=click.IntRange(min=1), help="End after so many specimens."),
@@ -120,6 +121,7 @@ def _go(
     arm: bool,
     yes: bool,
     take_down: bool,
+    clear: bool,
     skip: tuple[str, ...],
     again: tuple[str, ...],
     most: int | None,
@@ -165,7 +167,7 @@ def _go(
                 click.echo("Nothing was touched.")
                 return
         try:
-            run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down)
+            run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down, clear=clear and count == 1)
         except NotSafe:
             raise
         except (FaultError, LimitError, DeviceError) as error:

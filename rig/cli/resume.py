@@ -16,7 +16,8 @@ from rig.cli.files import FILE, PORTS, read_ports
 @click.option("--arm", is_flag=True, help="As for `dea-rig run`.")
 @click.option("--yes", is_flag=True, help="As for `dea-rig run`.")
 @click.option("--take-down", is_flag=True, help="As for `dea-rig run`.")
-def command(log: Path, out: Path, ports: Path | None, arm: bool, yes: bool, take_down: bool) -> None:
+@click.option("--clear", is_flag=True, help="As for `dea-rig run`: after a kill under voltage.")
+def command(log: Path, out: Path, ports: Path | None, arm: bool, yes: bool, take_down: bool, clear: bool) -> None:
     """Go on with the run in LOG that ended early: its next step, the same specimen, the same instruments."""
     from rig.base.outputs import check_new
     from rig.cli.running import run_and_tell
@@ -24,4 +25,4 @@ def command(log: Path, out: Path, ports: Path | None, arm: bool, yes: bool, take
 
     check_new(out)
     experiment = prepare_resumed(log, read_ports(ports))
-    run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down)
+    run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down, clear=clear)

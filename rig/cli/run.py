@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports; the highest voltage is asked for too.")
 @click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
 @click.option("--take-down", is_flag=True, help="Ramp down an output that is found live; default: ask.")
+@click.option("--clear", is_flag=True, help="Clear what the supply has latched: its cause is removed; default: ask.")
 def command(
     scene: Path,
     protocol: Path | None,
@@ -35,6 +36,7 @@ def command(
     arm: bool,
     yes: bool,
     take_down: bool,
+    clear: bool,
 ) -> None:
     """Run PROTOCOL on the bench of SCENE and log every byte. Ctrl-C ends it safely, Ctrl-Z or p pauses it.
 
@@ -55,7 +57,7 @@ def command(
     else:
         assert until is not None
         experiment = _until(scene, until, at_most or "60min", terms, read_ports(ports))
-    run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down)
+    run_and_tell(experiment, out, arm=arm, yes=yes, take_down=take_down, clear=clear)
 
 
 def _until(scene: Path, until: str, at_most: str, terms: int, ports: dict[str, dict[str, Any]] | None) -> Experiment:

@@ -24,6 +24,7 @@ from rig.safety.arming import undetectable
 from rig.scene.scene import Scene
 from rig.steps.advisor import Advisor
 from rig.steps.learn import Learn
+from rig.steps.output import CLEARED
 
 
 def prepare_step(scene: Path, title: str, step: Mapping[str, Any], ports: dict[str, Any] | None) -> Experiment:
@@ -35,7 +36,9 @@ def prepare_step(scene: Path, title: str, step: Mapping[str, Any], ports: dict[s
         return prepare(scene, steps, ports)
 
 
-def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, take_down: bool) -> None:
+def run_and_tell(
+    experiment: Experiment, out: Path, *, arm: bool, yes: bool, take_down: bool, clear: bool = False
+) -> None:
     """Carry out a prepared experiment with progress on the terminal, and say how it ended.
 
     Raises
@@ -54,6 +57,7 @@ def run_and_tell(experiment: Experiment, out: Path, *, arm: bool, yes: bool, tak
             "--arm on the command line" if arm else "",
             "--yes on the command line" if yes else "",
             "--take-down on the command line" if take_down else "",
+            CLEARED if clear else "",
         )
     begun = False
 

@@ -37,7 +37,7 @@ from rig.safety.limits import FilmLimits, Limit, Limits
 from rig.safety.second import SecondReading
 from rig.steps.advisor import Advisor
 from rig.steps.base import Action, Result, Turns, write_phase
-from rig.steps.output import choose_about_live_output, confirm_voltage
+from rig.steps.output import choose_about_live_output, confirm_voltage, refuse_latched
 from rig.steps.regain import regain_duration
 from rig.steps.rig import Rig
 
@@ -85,6 +85,8 @@ class Engine:
         How the operator asked for high voltage when he started the run; without it none is given.
     take_down : str
         How he chose, when he started the run, to have an output taken down that is found live; empty: he did not.
+    clear : str
+        How he said, when he started the run, that the cause of what the supply has latched is removed; likewise.
     guard_process : RemoteGuard, optional
         The guard, when it is a process of its own; without it the engine makes one for a supply in memory.
     show : callable, optional
@@ -106,6 +108,7 @@ class Engine:
         certificates: Mapping[str, Certificate] | None = None,
         requested: str = "",
         take_down: str = "",
+        clear: str = "",
         guard_process: RemoteGuard | None = None,
         show: Callable[[Status], None] | None = None,
         advisor: Advisor | None = None,
@@ -119,7 +122,7 @@ class Engine:
         self.control = control
         highest = max((action.highest_voltage for action in actions), default=0.0)
         arming = Arming(requested)
-        self.rig = Rig(bench, self.recorder, self.limits, gains, control, arming, highest, take_down)
+        self.rig = Rig(bench, self.recorder, self.limits, gains, control, arming, highest, take_down, clear)
         self.rig.advisor = advisor
         self._actions = actions
         self._progress = progress
@@ -321,6 +324,7 @@ class Engine:
             self._turn()
         self._take_turns(choose_about_live_output(self.rig))
         guard.check_off()
+        refuse_latched(self.rig)
 
     def _carry_out_all(self) -> None:
         total = sum(action.duration for action in self._actions)

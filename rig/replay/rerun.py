@@ -22,6 +22,7 @@ from rig.replay.recording import OperatorAct, Recording
 from rig.replay.steering import NANOSECONDS, SteeredBench
 from rig.replay.verify import GUARDED
 from rig.steps.advisor import Advice, Ask
+from rig.steps.output import CLEARED
 
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
@@ -104,6 +105,7 @@ def rerun(recording: Recording, *, steered: bool | None = None) -> Rerun:
         experiment.certificates,
         requested=AS_RECORDED,
         take_down=AS_RECORDED if operator.took_down else "",
+        clear=AS_RECORDED if operator.cleared else "",
         advisor=_Advisor(recording),
         kept=_Kept(recording),
     )
@@ -152,6 +154,7 @@ class _Operator(Control):
         )
         super().__init__(unattended=AS_RECORDED if nobody else "")
         self.took_down = any((c["device"], c["command"]) == ("hv", "take_down") for c in given)
+        self.cleared = any((c["device"], c["command"], c["argument"]) == ("hv", "clear", CLEARED) for c in given)
         self._questions, self._answers = deque(asked), deque(answered)
         self._coming: OperatorAct | None = None  # the answer to the question that is open
         self._wishes = deque(act for act in acts if act.what in ("pauses", "continues"))

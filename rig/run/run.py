@@ -42,12 +42,13 @@ class Consent:
     """What the operator chose when he started the run, each in words for the log; empty where he did not.
 
     ``arm``: high voltage is meant. ``answers``: questions are answered as expected, nobody is there. ``take_down``: an
-    output found live is to be ramped down.
+    output found live is to be ramped down. ``clear``: the cause of what the supply has latched is removed.
     """
 
     arm: str = ""
     answers: str = ""
     take_down: str = ""
+    clear: str = ""
 
 
 def run(
@@ -112,6 +113,7 @@ def run(
                 experiment.certificates,
                 requested=consent.arm,
                 take_down=consent.take_down,
+                clear=consent.clear,
                 guard_process=backend.guard,
                 show=show,
                 advisor=advisor,

@@ -12,6 +12,8 @@ from rig.steps.base import ALLOWED_S, Turns, allowed
 from rig.steps.rig import Rig
 from rig.steps.turns import wait
 
+CLEARED = "--clear on the command line"  # as the log has it
+
 
 def ramp_to(rig: Rig, target: float, limit: float) -> Turns:
     """Ramp, and wait until the measured voltage is there. A guard that is SAFE needs the operator's confirmation."""
@@ -48,18 +50,40 @@ def confirm_voltage(rig: Rig) -> Turns:
 
 
 def _clear_faults(rig: Rig) -> Turns:
-    """What the supply has latched (an earlier emergency off, a trip) is cleared only when the operator says so."""
+    """What the supply has latched (an earlier emergency off, a trip) is cleared only when the operator says so.
+
+    What he said when he started the run holds once: what latches later has another cause.
+    """
     guard = rig.guard
+    said, rig.clear = rig.clear, ""
     if guard is None or guard.last is None or not guard.last.flags & TRIP:
         return
-    words = f"hv: the supply has latched: {flag_names(guard.last.flags & TRIP)}."
-    if rig.control.unattended:
-        raise FaultError(f"{words} Nobody is there to find the cause and remove it; nothing was cleared.")
-    words += " Cause found and removed?"
-    said = yield from rig.ask(Question(words, expected="clear"))
-    guard.clear_faults(str(said))
+    if not said:
+        if rig.control.unattended:
+            raise _latched(guard.last.flags & TRIP)
+        words = f"hv: the supply has latched: {flag_names(guard.last.flags & TRIP)}. Cause found and removed?"
+        said = str((yield from rig.ask(Question(words, expected="clear"))))
+    guard.clear_faults(said)
     last = guard.last
     yield from wait(rig, lambda: guard.last is not last and guard.last is not None, ALLOWED_S, "A new measurement")
+
+
+def refuse_latched(rig: Rig) -> None:
+    """Where nobody can say that the cause is removed, a run with voltage ends before anything moves."""
+    guard = rig.guard
+    if guard is None or guard.last is None or rig.highest_voltage == 0.0 or rig.clear or not rig.control.unattended:
+        return
+    if guard.last.flags & TRIP:
+        raise _latched(guard.last.flags & TRIP)
+
+
+def _latched(flags: HVFlag) -> FaultError:
+    return FaultError(
+        f"hv: the supply has latched from before this run: {flag_names(flags)}. A run that was killed under voltage "
+        "leaves an emergency off: its guard did that. Nobody is there to say that the cause is found and removed, so "
+        "nothing was cleared and no voltage given; the output is off. When it is removed, give the same command with "
+        "--clear; or without --yes, and answer the question."
+    )
 
 
 def choose_about_live_output(rig: Rig) -> Turns:

@@ -44,6 +44,8 @@ class Rig:
         The highest that the plan asks for (V): what the operator confirms.
     take_down : str
         How he chose, when he started the run, to have an output taken down that is found live; empty: he did not.
+    clear : str
+        How he said, when he started the run, that the cause of what the supply has latched is removed; likewise.
 
     Attributes
     ----------
@@ -75,6 +77,7 @@ class Rig:
         arming: Arming,
         highest_voltage: float,
         take_down: str = "",
+        clear: str = "",
     ) -> None:
         self.bench = bench
         self.clock = bench.clock
@@ -86,6 +89,7 @@ class Rig:
         self.arming = arming
         self.highest_voltage = highest_voltage
         self.take_down = take_down
+        self.clear = clear
         self.guard: AnyGuard | None = None
         self.force_noise = math.nan
         self.question_number = ""  # which of the plan's questions is asked next ("3 of 34")

@@ -113,6 +113,7 @@ def tell(tmp_path: Path) -> Tell:
         control: Control | None = None,
         requested: str = "a test",
         take_down: str = "",
+        clear: str = "",
         checked: bool = True,
         stored_zero: float | None = None,
         nearer: bool = True,
@@ -152,7 +153,8 @@ def tell(tmp_path: Path) -> Tell:
 
         path = tmp_path / "run.mcap"
         with LogWriter(path) as log:
-            engine = Engine(bench, actions, log, gains, stop, progress, {"force": certificate}, requested, take_down)
+            known = {"force": certificate}
+            engine = Engine(bench, actions, log, gains, stop, progress, known, requested, take_down, clear)
             with pytest.MonkeyPatch.context() as patch:
                 if quick:
                     patch.setattr(engine_module, "SHORTEST_TURN_S", LONGEST_TURN_S)

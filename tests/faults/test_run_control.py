@@ -12,6 +12,7 @@ from rig.log.dataset import load_run
 from rig.log.reader import read_log
 from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
+from rig.steps.output import CLEARED
 
 Tell = Callable[..., Any]  # of conftest.Story
 LIVE = ("[simulation.hv]", "[simulation.hv]\nstart_live_V = 500.0")
@@ -213,6 +214,28 @@ def test_a_supply_found_live_is_left_alone_while_the_operator_thinks_and_when_he
     story = tell(control=Control([Operator(script)]), replace=LIVE)
     assert isinstance(story.error, Stopped) and not story.outcome.safe
     assert story.final_output == pytest.approx(500, abs=5) and not story.control_words and not story.stage_words[:-1]
+
+
+OPEN_ONCE = '[[simulation.fault]]\nrole = "hv"\nkind = "inhibit"\nduration_s = 0.01\n'
+
+
+@pytest.mark.slow
+def test_with_nobody_there_what_has_latched_is_refused_before_anything_moves_and_cleared_when_asked(tell: Tell) -> None:
+    latched = ("[simulation.film]", f"{OPEN_ONCE}[simulation.film]")
+    refused = tell(replace=latched)
+    assert refused.outcome.status == "fault" and refused.outcome.safe
+    assert "give the same command with --clear" in refused.outcome.reason
+    assert "has latched from before this run: inhibited" in refused.outcome.reason
+    stage = [float(refused.bench.world.stage.at(t)[0]) for t in (0.0, refused.end)]
+    assert stage[0] == stage[1] and not {"clear", "arm"} & set(refused.control_words)
+
+
+@pytest.mark.slow
+def test_what_the_operator_said_at_the_start_clears_it(tell: Tell) -> None:
+    latched = ("[simulation.film]", f"{OPEN_ONCE}[simulation.film]")
+    done = tell(replace=latched, clear=CLEARED)
+    assert done.outcome.status == "complete", done.outcome.reason
+    assert done.control_words[:2] == ["clear", "arm"]
 
 
 def test_what_the_supply_has_latched_is_cleared_only_when_the_operator_says_so(tell: Tell) -> None:
