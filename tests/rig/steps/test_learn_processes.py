@@ -205,6 +205,7 @@ def test_a_killed_engine_leaves_no_voltage_no_fit_and_a_run_that_goes_on(bench: 
     assert outcome(rest)[1]["safe"] == "yes"
 
 
+@pytest.mark.long
 def test_a_killed_fit_is_said_another_goes_on_and_three_in_a_row_end_the_step(bench: Bench) -> None:
     run, log = bench.run("unfitted.mcap")
     first = in_midst(bench, run, log)
