@@ -155,6 +155,15 @@ static int path_step(Problem *problem, const Grid *grid, const State *here, cons
     return *least > 0.0;
 }
 
+/* Whether the film narrows below its disk: it may be one that nothing leads to from rest. */
+static int leans(const Grid *grid, const State *state) {
+    double e[MOST_POINTS], q[MOST_POINTS];
+    strain(grid, state->c, e, q);
+    for (int64_t i = 0; i < grid->table->points; i++)
+        if (q[i] <= -1.0) return 1;
+    return 0;
+}
+
 /* Follow a state along its path, in steps that it chooses by itself. */
 static void follow(Problem *problem, const Table *table, Trace *out) {
     double height = problem->height, field = problem->field, end = field != 0.0 ? 2.0 : 1.0;
@@ -168,7 +177,7 @@ static void follow(Problem *problem, const Table *table, Trace *out) {
     careful_guess(problem, &out->grid, here);
     Iterate first = newton(problem, &out->grid, here, 1e-3, 15);
     out->steps = first.steps;
-    if (!first.ok) {
+    if (!first.ok || leans(&out->grid, here)) {
         out->progress = 0.0;
         go_to(problem, height, field, out->progress);
         careful_guess(problem, &out->grid, here);

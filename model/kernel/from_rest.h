@@ -50,7 +50,8 @@ static int connected(Problem *problem, const Table *check, const Grid *of, const
         guess(problem, &grid, &begun);
         Iterate found = newton(problem, &grid, &begun, WAY_GOAL, WAY_STEPS);
         problem->field = field;
-        good = found.ok && (led(problem, &grid, &begun, &end, 2) || led(problem, &grid, &begun, &end, 5));
+        good = found.ok && !leans(&grid, &begun) &&
+               (led(problem, &grid, &begun, &end, 2) || led(problem, &grid, &begun, &end, 5));
     }
     if (!good) return 0;
     Stations way;
@@ -70,6 +71,8 @@ static int from_rest(Problem *problem, const Table *const *tables, double tolera
         if (!tables[TRACE_MODES[k]]) return NEEDS_TABLE;
         follow(problem, tables[TRACE_MODES[k]], &path);
         steps += path.steps;
+        /* Few modes lead smoothly past the end of a film that narrows. */
+        if (k + 1 < TRACES && !slack && leans(&path.grid, &path.state)) continue;
         unstable |= path.limit;
         lost = path.reached;
         if (path.reached) {

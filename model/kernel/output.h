@@ -15,7 +15,7 @@ typedef struct {
     Real log_area, radius; /* largest ln(l1 l2), and R/b where it stands */
     Real hoop, meridional; /* smallest stresses */
     Real log_stretch;
-    Real softening; /* largest share of the stiffness that the voltage takes away */
+    Real softening; /* largest share of the stiffness that the voltage takes; 1 where the meridian leans inwards */
 } Extremes;
 
 /* A solved state: its elements from disk to ring, the state at their points, and which are relaxed; NULL where none. */
@@ -267,6 +267,9 @@ static void extremes(Problem *problem, const Solved *solved, Real lam, Extremes 
     out->log_stretch = larger(largest(solved, log1, edge.log1[0], edge.log1[1], &place),
                               largest(solved, log2, edge.log2[0], edge.log2[1], &place));
     if (any(charged)) out->softening = larger(out->softening, softened(problem, solved, &edge));
+    for (int64_t k = 0; k < elements; k++)
+        for (int64_t i = 0; i < n; i++)
+            out->softening = pick(solved->at[k].along[i] <= 0.0, of(1.0), out->softening);
 }
 
 /* Derivatives of the dimensionless force. */

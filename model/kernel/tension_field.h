@@ -13,6 +13,7 @@ enum {
 #define CUT_LEVEL_FACTOR 2.0
 #define SOFT_BEFORE_FACTOR 0.2
 #define CUT_WEIGHT 0.1
+#define CUT_POWER 2.6
 #define CURVED 2.0
 #define SLACK_GOALS 5.0 /* times Newton's goal: share of the largest tension that may have a wrong sign */
 
@@ -157,7 +158,8 @@ static Real cut_step(Problem *problem, Cut *cut, Cone *cones, double aim, Mask o
     Real change = pick(problem->field != 0.0, seen.slopes * sqrt_of(seen.maxwell), seen.slopes);
     add_step(cut, own, dc, dw, change, open);
     change = larger(change, larger(CURVED * seen.bent * sqrt_of(seen.bent_maxwell), seen.strains / seen.size));
-    change = larger(change, CUT_WEIGHT * moved_breaks(cut, seen.tension, breaks));
+    Real shift = moved_breaks(cut, seen.tension, breaks);
+    change = larger(change, larger(CUT_WEIGHT * shift, CUT_POWER * shift * sqrt_of(shift)));
     found->lam = pick(open, lam, found->lam);
     found->tail = pick(open, tail_of_panels(problem, cut, &system, lam), found->tail);
     found->ok = (open & positive & system.positive & (lam > 0.0)) | (is_not(open) & found->ok);

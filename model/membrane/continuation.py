@@ -59,6 +59,12 @@ def _no_width(problem: Problem, grid: Grid, state: State) -> NDArray[np.bool_]:
     return np.asarray(((law.t2 < 0.1 * law.t1) & (law.h22 <= 0.0)).any(axis=(0, 1)))
 
 
+def leans(grid: Grid, state: State) -> NDArray[np.bool_]:
+    """Where a film narrows below its disk: it may be one that nothing leads to from rest."""
+    _, q = grid.strain(state.c)
+    return np.asarray((q <= -1.0).any(axis=(0, 1)))
+
+
 def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
     """Follow every state along its path, in steps that each state chooses by itself."""
     states = len(problem.span)
@@ -76,7 +82,7 @@ def follow(problem: Problem, modes: int, *, relaxed: bool) -> Trace:
     begin = at(problem, everyone, progress)
     found = correct(begin, grid, first(begin, grid), 1e-3, 15)
     steps = found.steps
-    current, alive = found.state, found.ok.copy()
+    current, alive = found.state, found.ok & ~leans(grid, found.state)
     if not alive.all():
         late = np.flatnonzero(~alive)
         progress[late] = 0.0

@@ -51,17 +51,19 @@ def solve(
     end = 1.0 if problem.film.field is None else 2.0
     for modes in TRACE_MODES:
         path = continuation.follow(problem.take(rest), modes, relaxed=relaxed)
+        # Few modes lead smoothly past the end of a film that narrows.
+        coarse = continuation.leans(path.grid, path.state) & (modes < TRACE_MODES[-1]) & ~slack[rest]
         ended.steps[rest] += path.steps
-        ended.unstable[rest] |= path.limit
+        ended.unstable[rest] |= path.limit & ~coarse
         progress[rest] = path.progress
-        good = np.flatnonzero(path.reached)
+        good = np.flatnonzero(path.reached & ~coarse)
         begin = Start(path.grid.take(good), path.state.take(good))
         reached = rest[good]
         found, lost = settled(problem, reached, tolerance, begin, relaxed, sensitivities, ended)
         answers += found
         left = np.zeros(states, dtype=np.bool_)
         near = (path.progress > end - 1.0) & (path.progress > end - CLOSE) & (not relaxed)
-        left[rest[~path.reached & (near | ~path.limit)]] = left[reached[lost]] = True
+        left[rest[coarse | ~path.reached & (near | ~path.limit)]] = left[reached[lost]] = True
         left &= ~slack
         lost = lost[left[reached[lost]]]
         reached, begin, rest = reached[lost], begin.take(lost), np.flatnonzero(left)
@@ -143,7 +145,8 @@ def connected(problem: Problem, end: Start, lam: Array) -> NDArray[np.bool_]:
         bare = continuation.at(problem, rest, np.ones(len(rest)))
         laid = end.grid.take(rest)
         found = refinement.newton(bare, laid, guess(bare, laid), WAY_GOAL, WAY_STEPS)
-        rest, begun = rest[found.ok], found.state.take(found.ok)
+        begins = found.ok & ~continuation.leans(laid, found.state)
+        rest, begun = rest[begins], found.state.take(begins)
         for steps in WAY:
             if len(rest) == 0:
                 break

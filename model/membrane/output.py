@@ -25,7 +25,7 @@ class Extremes:
     hoop: Array
     meridional: Array
     log_stretch: Array
-    softening: Array  # largest share of the stiffness that the voltage takes away, see `softened`
+    softening: Array  # largest share of the stiffness that the voltage takes away; 1 where the meridian leans inwards
 
     def take(self, index: Index) -> Extremes:
         return Extremes(*(getattr(self, f.name)[index] for f in fields(self)))
@@ -175,6 +175,8 @@ def extremes(problem: Problem, grid: Grid, state: State, at: Points, lam: Array)
     else:
         softening = (2.0 * law.maxwell / (law.h11 + 2.0 * law.maxwell)).max(axis=(0, 1))
         softening = np.maximum(softening, _softened(problem, log, edge))
+    # Like a soap film between rings too far apart, a film that narrows below its disk may be one that no rest leads to.
+    softening = np.where((at.along <= 0.0).any(axis=(0, 1)), 1.0, softening)
     return Extremes(
         log_area=best[0],
         radius=radius[0],

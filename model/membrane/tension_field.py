@@ -33,7 +33,10 @@ ROUNDS = 4
 SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a wrong sign, as it has beside a cut
 STEPS, CAREFUL_STEPS = 15, 40  # most of a rung
 CALM = 1e-4  # change of the strains from which a careful solution moves its cuts
-CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change: the force feels its third power
+CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change
+CUT_POWER = (
+    2.6  # of its power 1.5: the force errs by some half of the third power of the shift, the estimate allows two
+)
 CAREFUL_WEIGHT = 1.0  # where the folds have hardly any stiffness left: the force feels it that much more
 
 
@@ -98,8 +101,8 @@ def zones(grid: Grid, state: State, at: Points, slack: float = 0.0, *, between: 
     """Zones of a state, by the hoop stress where taut and by the slack in the width where wrinkled.
 
     A sign against the element's own kind counts only beyond ``slack`` times the largest value: with cuts in place their
-    vicinity is round-off. Without ``between`` the points alone are asked: near loss of convexity the stretch is too
-    steep for the polynomial through them.
+    vicinity is round-off. Without ``between`` the points alone are asked, and both ends of taut elements: near loss of
+    convexity the stretch is too steep for the polynomial through them.
     """
     tension = at.law.t2 if state.relaxed is None else np.where(state.relaxed, at.hoop - at.log[1], at.law.t2)
     points, m, states = tension.shape
@@ -110,8 +113,14 @@ def zones(grid: Grid, state: State, at: Points, slack: float = 0.0, *, between: 
         fine = fine.reshape(FINE, m, states).swapaxes(0, 1).reshape(m * FINE, states)
         share = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, FINE)))
     else:  # each point decides for itself: no polynomial passes through them
-        fine = tension.swapaxes(0, 1).reshape(m * points, states)
         share = 0.5 * (1.0 + grid.table.xi)
+        if whole:  # a narrow zone may stand between the disk and the first point
+            ends = np.tensordot(grid.table.ends, tension, 1)
+            if state.relaxed is not None:
+                ends = np.where(state.relaxed[:1], tension[[0, -1]], ends)
+            tension = np.concatenate((ends[:1], tension, ends[1:]))
+            share = np.concatenate(([0.0], share, [1.0]))
+        fine = tension.swapaxes(0, 1).reshape(m * len(share), states)
     folded = fine < 0.0
     if slack > 0.0 and whole and state.relaxed is not None:
         kind = np.repeat(state.relaxed[0], len(share), axis=0)
@@ -214,7 +223,8 @@ def _settle(
         breaks, shift = _moved(grid, panels, taut, cones.which, tension)
         if careful:
             breaks = np.where(change <= CALM, breaks, grid.breaks)
-        change = np.maximum(change, (CAREFUL_WEIGHT if careful else CUT_WEIGHT) * shift)
+        off = np.maximum((CAREFUL_WEIGHT if careful else CUT_WEIGHT) * shift, CUT_POWER * shift * np.sqrt(shift))
+        change = np.maximum(change, off)
         done = change <= goal
         # Where it has settled the state belongs to the cuts as they were.
         grid = Grid.lay(grid.table.modes, np.where(done, grid.breaks, breaks))

@@ -33,7 +33,7 @@ from model.membrane.viscous_films import FLAT, Films, Instant, Load, State
 
 MOST_STEPS = 25
 LONGEST_STRAIN_STEP = 0.5  # of an elastic strain of a branch, in one step of Newton's method
-LONGEST_RISE, LONGEST_FALL = 0.1, 0.5  # of a free disk: over the ring radius, or its height where that is more; of it
+LONGEST_RISE, LONGEST_FALL = 0.1, 0.8  # of a free disk: over the ring radius, or its height where that is more; of it
 LEAST_SLACK = 1e-15  # of a point that has begun to fold
 MOST_FLIPS = 12  # steps of Newton's method in which points may fold or get taut again
 
@@ -242,7 +242,9 @@ def balance(
     problem = Problem(Film(points.law, field, count), films.log_prestretch, films.span, height)  # type: ignore[arg-type]
     step = ritz.Step(dc, dw, lam, ok, diagonal)
     state = State(c, w, x, height, slack)
-    tail = lam * np.where(height > 2.0 * FLAT, np.abs(refinement.tail(problem, grid, ritz.State(c, w), step)), 0.0)
+    # Strains are of the order of the slopes' square. What is more in a nearly flat film Newton's method has left there.
+    last = ritz.State(np.minimum(np.abs(c), (w * w).max(axis=(0, 1))), w)
+    tail = lam * np.where(height > 2.0 * FLAT, np.abs(refinement.tail(problem, grid, last, step)), 0.0)
     if free is not None:
         tail = tail / np.abs(free.excess)
     return Balance(films, state, lam, u, ok, tail, at.logs, points, system, inverse, branches, at.raw, folds, free)

@@ -52,6 +52,18 @@ def test_without_branches_it_is_where_the_actuator_is() -> None:
         assert h == pytest.approx(equilibria(Actuator(film([]), SPRING), voltage).stable[0].h, rel=1e-6)
 
 
+@pytest.mark.parametrize("weight", [1e-12, 1e-9, 1e-5])
+def test_under_a_weight_of_nearly_nothing_the_film_is_a_flat_membrane(weight: float) -> None:
+    """Of the nominal tension N = T s/lp^2 of the flat film: h = W ln(b/a) / (2 pi N)."""
+    specimen = film(TWO)
+    found = creep(Actuator(specimen, Mass(weight)), [0.0, 1.0, 2.0], tolerance=1e-6)
+    stress = sum(mu * (1.2**al - 1.2 ** (-2.0 * al)) for mu, al in zip(PARKER.mu, PARKER.alpha, strict=True))
+    flat = weight * np.log(5.0) / (2.0 * np.pi * 40e-6 / 1.2**2 * stress)
+    assert found.status.tolist() == [Status.TAUT] * 3
+    np.testing.assert_allclose(found.h, flat, rtol=1e-7)
+    assert (found.error_estimate <= 1e-6).all()
+
+
 def simulated(spring: Spring, specimen: Specimen, t: Sequence[float], voltage: Sequence[float], steps: int) -> Array:
     """Displacement at ``t`` of the simulated bench's film on a soft rig, whose compliance is the spring."""
     branches = [(one.ratio, one.time) for one in specimen.material.branches]

@@ -1,0 +1,48 @@
+"""States in which the random search (`model.verification.search`) once found two answers, each with its kind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from model.material.gent import Gent
+from model.material.materials import Material
+from model.membrane.solve import Status, solve, solve_many
+from model.specimen import Specimen
+
+# A soft film on a small disk narrows below it like a soap film between rings, and has no state from 7.474 mm on at 0 V,
+# where finite elements from rest end; further states stand beyond, of a film that passes under its own disk.
+NARROWING = Specimen(
+    0.0016828514334271286, 0.02, 1.3757270522133256e-05, 1.752144048012767,
+    Material("narrows", (29326.095153447222, -4541.490766590298), (1.2122235912685604, -3.073681047731639), 3.0),
+)  # fmt: skip
+ENDS = 7.474e-3
+
+
+@pytest.mark.parametrize("voltage", [0.0, pytest.param(135.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("tolerance", [pytest.param(1e-4, marks=pytest.mark.slow), 1e-6])
+def test_a_film_that_narrows_too_far_has_no_state_at_any_tolerance(tolerance: float, voltage: float) -> None:
+    h = np.array([0.95, 1.05, 1.5]) * ENDS
+    found = solve_many(NARROWING, h, voltage, tolerance=tolerance, wrinkling="tension_field")
+    assert found.status.tolist() == [Status.TAUT, Status.UNSTABLE, Status.UNSTABLE]
+
+
+# A cut that stood a twentieth of its element off; and a narrow fold between the disk and the first point of a taut film.
+EDGES = [
+    (Specimen(0.0028381323735620677, 0.02, 2.7457615799781977e-05, 1.0041689131577993,
+              Material("gent", (49680.96072649929,), (18.77223181766785,), 3.0, law=Gent)),
+     0.005632927592706611, 476.88668935238866),
+    (Specimen(0.0010256989961124965, 0.02, 1.0407320364249633e-05, 1.1148466045579917,
+              Material("three", (86640.62249606973, -24997.52952971192, 6.207897483266936),
+                       (3.467858756186587, -1.8396556604874266, 6.951890042087668), 3.0)),
+     0.007729527303291478, 451.9082583557318),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("film", "h", "voltage"), EDGES)
+def test_edges_of_folded_zones_are_in_the_stated_error(film: Specimen, h: float, voltage: float) -> None:
+    truth = solve(film, h, voltage, tolerance=1e-10, wrinkling="tension_field")
+    for tolerance in (1e-4, 1e-5, 1e-6, 1e-8):
+        found = solve(film, h, voltage, tolerance=tolerance, wrinkling="tension_field")
+        assert found.status is Status.WRINKLED
+        assert abs(found.force / truth.force - 1.0) <= found.error_estimate + truth.error_estimate
