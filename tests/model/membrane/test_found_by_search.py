@@ -27,7 +27,7 @@ def test_a_film_that_narrows_too_far_has_no_state_at_any_tolerance(tolerance: fl
     assert found.status.tolist() == [Status.TAUT, Status.UNSTABLE, Status.UNSTABLE]
 
 
-# A cut that stood a twentieth of its element off; and a narrow fold between the disk and the first point of a taut film.
+# A cut that stood a twentieth of its element off; and a narrow fold between the disk and the first point of a film.
 EDGES = [
     (Specimen(0.0028381323735620677, 0.02, 2.7457615799781977e-05, 1.0041689131577993,
               Material("gent", (49680.96072649929,), (18.77223181766785,), 3.0, law=Gent)),
