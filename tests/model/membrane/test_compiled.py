@@ -18,13 +18,14 @@ from model.material.mooney_rivlin import MooneyRivlin
 from model.material.neo_hooke import NeoHooke
 from model.material.yeoh import Yeoh
 from model.membrane import compiled
+from model.membrane.flat import REAL
 from model.membrane.solve import Solutions, Status, solve, solve_many
 from model.specimen import Specimen
 from model.verification.search import draw
 
 pytestmark = pytest.mark.skipif(load() is None, reason=says())
 
-NUMBERS = compiled.NUMBERS[:6]
+NUMBERS = REAL[:6]
 FILM = Specimen(4e-3, 20e-3, 40e-6, 1.2, NAMED["parker-cao2018"])
 # Low exponents pull in before they lose tension.
 SOFT = Specimen(4e-3, 20e-3, 100e-6, 3.0, Material("soft", (1e5,), (1.3,), 3.0))
@@ -270,6 +271,15 @@ def test_flat_slack_and_impossible_states_have_the_status_of_the_path_for_arrays
         mine, theirs = both(film, h, v, tolerance=1e-6, wrinkling=wrinkling)
         np.testing.assert_array_equal(mine.status, theirs.status)
         np.testing.assert_allclose(mine.force, theirs.force, rtol=1e-9)
+
+
+def test_a_film_alone_is_read_as_among_others() -> None:
+    films, _, _ = random_films(20, seed=4)
+    films += [
+        replace(FILM, material=Material(name, mu, alpha, 2.5, law=law)) for name, (law, mu, alpha) in LAWS.items()
+    ]
+    for film, record in zip(films, compiled._films(films), strict=True):
+        assert bytes(compiled._film(film)) == record.tobytes()
 
 
 def test_films_that_the_kernel_does_not_know_are_left_to_others() -> None:
