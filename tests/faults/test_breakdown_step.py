@@ -6,8 +6,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
+from drivers.roles import HVFlag
 from rig.base.errors import LimitError
 from rig.log.reader import read_log
 from rig.sim.truth import Fault
@@ -56,6 +58,46 @@ def test_a_breakdown_is_the_result_and_the_output_is_off_at_once(tell: Tell, rat
     assert "snapshot" in read_log(story.log).metadata
     after = [t for t, volts in story.outputs if volts > 60.0]
     assert not after or max(after) < story.end - 0.5
+
+
+@pytest.mark.parametrize(
+    "films",
+    [pytest.param(3, marks=pytest.mark.slow), pytest.param(500, marks=[pytest.mark.long, pytest.mark.timeout(7200)])],
+)
+def test_every_breakdown_is_off_and_proven(tell: Tell, films: int) -> None:
+    """Of films of any strength, at any displacement and rate, with arcs of any resistance."""
+    rng, broken = np.random.default_rng(11), 0
+    while broken < films:
+        strength, h = 40.0 * rng.weibull(6.0), rng.uniform(1.0, 6.0)
+        rate, arc = rng.uniform(100.0, 500.0), 10.0 ** rng.uniform(1.0, 4.0)
+        ramp = f'[[step]]\ndo = "ramp"\ndisplacement_mm = {h:.3f}\nspeed_mm_per_s = 4.0\n'
+        story = tell(
+            replace=("[simulation.film]", f"[simulation.film]\nbreakdown_field_MV_per_m = {max(strength, 12.0):.4g}"),
+            also=("[simulation.hv]", f"[simulation.hv]\narc_resistance_kOhm = {arc:.4g}"),
+            protocol=TO_THE_FILM + ramp + f'[[step]]\ndo = "breakdown"\nceiling_V = 1700\nrate_V_per_s = {rate:.4g}\n',
+            checked=False,
+            quick=True,
+        )
+        what = (strength, h, rate, arc, story.outcome)
+        assert story.outcome.safe and story.outcome.status in ("complete", "limit"), what
+        assert story.final_output < 60.0, what
+        log = read_log(story.log)
+        samples = log.columns("/hv/sample")
+        assert (np.abs(samples["voltage_V"][-2:]) < 60.0).all() and not (
+            samples["flags"][-2:] & HVFlag.ON.value
+        ).any(), what
+        (outcome,) = {one["outcome"] for one in results(story).values()} or {"none"}
+        if story.bench.world.broken_down:
+            broken += 1
+            assert outcome == "breakdown" and "emergency_off" in story.control_words, what
+            found = results(story)["voltage"]
+            truth = story.bench.world.film.breakdown_voltage(h * 1e-3)
+            assert abs(found["value"] - truth) < 3.0 * found["standard_uncertainty"] + 0.02 * truth, (
+                what,
+                found,
+                truth,
+            )
+        story.log.unlink()
 
 
 def test_a_film_that_bears_the_ceiling_is_censored_there_and_the_run_goes_on(tell: Tell) -> None:
