@@ -25,7 +25,7 @@ CHECK_MODES = 6  # of a way that is only looked at
 WAY = (2, 5)  # steps of V^2 to an answer that is there already: so many, and then so many
 WAY_GOAL, WAY_STEPS = 3e-2, 8  # of Newton on that way
 ROUGH = 1e-6  # tolerance on the way
-TIGHT = 1e-8  # that of a wrinkled state which does not settle to a looser one
+TIGHT, LEAST = 1e-8, 1e-12  # those of a wrinkled state which does not settle to a looser one
 
 
 class Ended:
@@ -72,7 +72,7 @@ def solve(
     if len(reached):
         # With folds a tighter tolerance begins with more modes; plain layers ask for short elements.
         begin = begin if relaxed else _in_pieces(problem.take(reached), begin)
-        least = min(tolerance, TIGHT) if relaxed else tolerance
+        least = max(min(0.01 * tolerance, TIGHT), LEAST) if relaxed else tolerance
         found, _ = settled(problem, reached, least, begin, relaxed, sensitivities, ended)
         answers += found
     done = np.zeros(states, dtype=np.bool_) if relaxed else np.ones(states, dtype=np.bool_)

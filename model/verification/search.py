@@ -35,7 +35,7 @@ ALONE = 10  # one state of so many is asked for alone, and with derivatives
 SWEPT = 4  # one state of so many stands in a sweep
 STEP = 1e-3  # of the voltage and of the displacement
 PLACES = (-2, -1, 0, 1, 2)  # steps of a sweep
-BEYOND = 0.5  # a force may be off what its neighbours lead to by this share of how far it is off the nearest two
+BEYOND = 0.25  # of the curve of a sweep: a force may be so far off what its neighbours lead to, where a fold begins too
 COMPANY = 1e-12  # relative: what the order in which a processor adds may change
 # A continuation that ends, or a law that falls, within this share of the voltage may be judged either way.
 EDGE = 4e-3
@@ -245,11 +245,11 @@ class _Judge:
             for i, k in np.argwhere(np.diff(rank, axis=1) < 0).tolist():
                 self._tell(i, f"{way}, then", int(found.status[i, k + 1]))
         f = found.force.T
-        beside, lead = 0.5 * (f[1] + f[3]), (4.0 * (f[1] + f[3]) - f[0] - f[4]) / 6.0
+        lead, curve = (4.0 * (f[1] + f[3]) - f[0] - f[4]) / 6.0, np.abs(np.diff(f, 2, axis=0)).max(axis=0)
         error = found.error_estimate.T
         noise = error[2] + (4.0 * (error[1] + error[3]) + error[0] + error[4]) / 6.0
         off = np.abs(lead / f[2] - 1.0)
-        bound = noise + BEYOND * np.abs(beside / f[2] - 1.0)
+        bound = noise + BEYOND * curve / np.abs(f[2])
         for i in np.flatnonzero(found.answered.all(axis=1) & ~(off <= bound)).tolist():
             self._tell(i, f"{way}, led to", Status.TAUT, float(off[i]), float(bound[i]))
 

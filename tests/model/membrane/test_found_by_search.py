@@ -27,7 +27,7 @@ def test_a_film_that_narrows_too_far_has_no_state_at_any_tolerance(tolerance: fl
     assert found.status.tolist() == [Status.TAUT, Status.UNSTABLE, Status.UNSTABLE]
 
 
-# A cut that stood a twentieth of its element off; and a narrow fold between the disk and the first point of a film.
+# A cut that stood a twentieth of its element off; and narrow folds between the disk and the first point of a film.
 EDGES = [
     (Specimen(0.0028381323735620677, 0.02, 2.7457615799781977e-05, 1.0041689131577993,
               Material("gent", (49680.96072649929,), (18.77223181766785,), 3.0, law=Gent)),
@@ -36,6 +36,10 @@ EDGES = [
               Material("three", (86640.62249606973, -24997.52952971192, 6.207897483266936),
                        (3.467858756186587, -1.8396556604874266, 6.951890042087668), 3.0)),
      0.007729527303291478, 451.9082583557318),
+    (Specimen(0.004880188738951375, 0.02, 5.4658612906117444e-05, 2.247283626587139,
+              Material("four", (10557.263802621905, 6.861583907656115, 1.1177447202323028, 43.748458121739205),
+                       (2.2683712358497967, 8.251370229941669, 10.706291910509446, 5.953935816851401), 3.0)),
+     0.007459300435223652, 490.4246457202749),
 ]  # fmt: skip
 
 
@@ -46,3 +50,14 @@ def test_edges_of_folded_zones_are_in_the_stated_error(film: Specimen, h: float,
         found = solve(film, h, voltage, tolerance=tolerance, wrinkling="tension_field")
         assert found.status is Status.WRINKLED
         assert abs(found.force / truth.force - 1.0) <= found.error_estimate + truth.error_estimate
+
+
+def test_a_soft_state_that_does_not_settle_from_few_modes_is_begun_with_more() -> None:
+    film = Specimen(
+        0.0019144421315530017, 0.02, 1.0676579503179238e-05, 2.001810470010569,
+        Material("two", (21982.89266199965, 7.0180668705049), (1.4479192862819448, 10.546349466101926), 3.0),
+    )  # fmt: skip
+    rough, fine = (solve(film, 0.0038317815956783506, 123.84649159008657, tolerance=t, wrinkling="tension_field")
+                   for t in (1e-6, 1e-8))  # fmt: skip
+    assert rough.status is fine.status is Status.WRINKLED
+    assert abs(rough.force / fine.force - 1.0) <= rough.error_estimate + fine.error_estimate
