@@ -113,6 +113,10 @@ class Rise(Action):
             raise
         last.write(self, BORNE, rig.clock.now() - began)
 
+    def rise_in(self, seconds: float) -> float:
+        """By how much (V) the output rises at most in so many ``seconds``: a stair is climbed at the supply's ramp."""
+        return min(self.most * seconds, self.rate * max(seconds, STAIR_S))
+
     def _raise(self, rig: Rig) -> Turns:
         start, end = self.voltage
         if self.rate < self.most:
@@ -157,7 +161,7 @@ class Last:
         """Write the result to the log; returns it in words."""
         volts = self._newest.voltage if self._newest is not None else math.nan
         gap = self._newest.t - self._before.t if self._newest is not None and self._before is not None else math.nan
-        apart = action.rate * gap / math.sqrt(12.0)  # it broke anywhere between this sample and the next
+        apart = action.rise_in(gap) / math.sqrt(12.0)  # it broke anywhere between this sample and the next
         peak, edge, charge = film_at(self._rig.scene.specimen.specimen(), self._h, volts)
         share = apart / volts
         for name, value, uncertainty, unit in (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,12 +26,6 @@ speed_mm_per_s = 4.0
 TEST = HEAD + '[[step]]\ndo = "breakdown"\nceiling_V = 1700\n'
 AFTER = '[[step]]\ndo = "ramp"\ndisplacement_mm = 2.0\nspeed_mm_per_s = 4.0\n'
 WEAK = ("[simulation.film]", "[simulation.film]\nbreakdown_field_MV_per_m = 40.0")
-
-
-@pytest.fixture
-def tell(tell: Tell) -> Tell:
-    """With the ramp of the scenes: how well a breakdown voltage is known depends on it."""
-    return partial(tell, quick=False)
 
 
 def results(story: Any) -> dict[str, dict[str, Any]]:
