@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 
@@ -14,6 +15,7 @@ from drivers.instruments.zaber import NumberedLines
 from drivers.instruments.zaber.codec import WARNINGS, Alert, Codec, Info, Message, Reply, checksum, encode
 from drivers.instruments.zaber.device import ZaberStage
 from drivers.links.link import DeviceLost, DeviceRefused, DeviceSilent
+from drivers.recorded import Exchange, Passed
 
 STEP = 0.49609375e-6  # 6.35 mm / 200 / 64
 
@@ -770,3 +772,16 @@ def test_in_a_served_log_a_motion_is_alike_within_twenty_steps(steps: int, alike
     assert dialect.alike(b"1 0 move abs 1000", b"1 0 move abs %d" % (1000 + steps)) is alike
     assert not dialect.alike(b"1 0 move abs 1000", b"2 0 move abs 1000")
     assert dialect.alike(b"1 0 get pos", b"1 0 get pos") and not dialect.alike(b"1 0 get pos", b"1 0 stop")
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_in_a_served_log_an_answer_bears_the_number_of_the_request_that_asks_now(count: int) -> None:
+    """And of several pieces comes what they make together, when the last one came."""
+    whole = b"@01 0 07 OK IDLE WR 1000\r\n"
+    cuts = [len(whole) * k // count for k in range(count + 1)] if count else []
+    answers = tuple((0.1 * k, whole[a:b]) for k, (a, b) in enumerate(itertools.pairwise(cuts)))
+    exchange = Exchange(Passed(0.0, True, b"/1 0 07 get pos\n"), b"1 0 get pos", answers)
+    dialect = NumberedLines(b"\n")
+    expected = ((0.1 * (count - 1), b"@01 0 42 OK IDLE WR 1000\r\n"),) if count else ()
+    assert dialect.anew(exchange, b"/1 0 42 get pos\n") == expected
+    assert dialect.anew(exchange, b"nonsense\n") == answers

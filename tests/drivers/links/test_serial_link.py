@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import subprocess
@@ -242,6 +243,24 @@ def test_a_port_that_comes_back_under_its_name_is_opened_again(tmp_path: Path) -
     assert second.read(3) == b"off"
     link.close()
     second.unplug()
+
+
+def test_a_port_that_is_there_but_cannot_be_opened_is_tried_again(
+    other_end: Pty, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    link = SerialLink("hv", other_end.port, 115200, clock=lambda: now[0])
+
+    def busy(self: SerialLink, **keys: Any) -> Any:
+        raise OSError(errno.EBUSY, "Device or resource busy")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SerialLink, "_open", busy)
+        now[0] += 1.0
+        assert not link.reopen() and link.counters.get("reopened", 0) == 0
+    now[0] += 1.0
+    assert link.reopen() and link.counters["reopened"] == 1
+    link.close()
 
 
 def test_another_adapter_under_the_same_name_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
