@@ -1,5 +1,5 @@
-/* Wrinkled films: model/membrane/tension_field.py, from a state of the plain equations on. The film is cut where its hoop
-   tension vanishes; a wrinkled element is a straight cone, the others (panels) are as in ritz.h. Whatever does not
+/* Wrinkled films: model/membrane/tension_field.py, from a state of the plain equations on. The film is cut where its
+   hoop tension vanishes; a wrinkled element is a straight cone, the others (panels) are as in ritz.h. Whatever does not
    settle is left to others. */
 #ifndef DEA_TENSION_FIELD_H
 #define DEA_TENSION_FIELD_H
@@ -14,6 +14,7 @@ enum {
 #define SOFT_BEFORE_FACTOR 0.2
 #define CUT_WEIGHT 0.1
 #define CUT_POWER 2.6
+#define CUT_GOAL 0.9 /* a cut stays where it has settled: what it lacks must leave room for the rest of the estimate */
 #define CURVED 2.0
 #define SLACK_GOALS 5.0 /* times Newton's goal: share of the largest tension that may have a wrong sign */
 
@@ -173,6 +174,7 @@ static Real cut_step(Problem *problem, Cut *cut, Cone *cones, double aim, Mask o
 
 /* Newton on the state together with the cuts: `settle`. */
 static Iterate settle(Problem *problem, Cut *cut, double aim) {
+    aim *= CUT_GOAL;
     Cone cones[MOST_ELEMENTS];
     Mask every = problem->counts, open = every, done = is_not(yes());
     Iterate found = {of(NAN), of(NAN), of(NAN), of(NAN), counted(open, 0), done};

@@ -39,6 +39,7 @@ CUT_WEIGHT = 0.1  # of a cut's shift beside the strains' change
 CUT_POWER = (
     2.6  # of its power 1.5: the force errs by some half of the third power of the shift, the estimate allows two
 )
+CUT_GOAL = 0.9  # a cut stays where it has settled: what it lacks must leave room for the rest of the estimate
 CAREFUL_WEIGHT = 1.0  # where the folds have hardly any stiffness left: the force feels it that much more
 
 
@@ -188,6 +189,7 @@ def settle(
     a hoop tension that is a small rest, and steps of both together overshoot.
     """
     assert state.relaxed is not None
+    goal *= CUT_GOAL
     zones = state.relaxed[0, :, 0].tolist()
     folded = tuple(k for k, wrinkled in enumerate(zones) if wrinkled)
     taut = tuple(k for k, wrinkled in enumerate(zones) if not wrinkled)

@@ -198,6 +198,17 @@ def test_wrinkled_films_have_the_digits_of_the_path_for_arrays(tolerance: float)
             np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-9, atol=1e-12, err_msg=name)
 
 
+def test_cuts_that_settle_just_in_time_do_not_keep_the_estimate_above_the_tolerance() -> None:
+    """They stay where they have settled, so that no more modes would help: ten milliseconds a state elsewhere."""
+    film = replace(FILM, prestretch=1.0)
+    state = {"tolerance": 1e-6, "relaxed": True, "sensitivities": False}
+    for h in np.linspace(9.72e-3, 9.74e-3, 30).tolist():
+        one = compiled.solve_one(film, h, 1500.0, **state)
+        assert one is not None
+        assert one.answered
+        assert one.answer.modes <= 7
+
+
 def test_order_and_company_change_no_bit() -> None:
     films, h, voltage = random_films(30, seed=5)
     found = solve_many(films, h, 0.5 * voltage)
