@@ -15,6 +15,7 @@ from typing import Any
 
 from calibration.electrical.charge import ByCharge, Charging, Known, NotResolved, Permittivity, permittivity
 from calibration.electrical.rows import currents_of
+from calibration.film.suspects.softening import KEY as SOFTENING
 from rig.analysis.charge import charging_of
 from rig.analysis.film import Found, identify_logs
 from rig.base.errors import DataError
@@ -47,6 +48,7 @@ def identify_with_charge(paths: Sequence[Path], **settings: Any) -> Found:
         "each": False,
         "starts": STARTS,
         "near": (found.identification.material,),
+        "along": [key for key in settings.get("along", ()) if key != SOFTENING],
     }
     by_force = identify_logs(paths, **{**settings, **alone}).identification.quantities.get("eps_r")
     film = found.identification.material
