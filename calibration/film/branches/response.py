@@ -56,9 +56,13 @@ class Relaxed:
             values.append(one)
             first += one.shape[-1]
         table = np.concatenate(values, axis=-1)  # (levels, GRID, columns)
+        self.none = False
         for k, level in enumerate(table):
             known = np.isfinite(level).all(axis=1)
-            if not known.any():  # no state at this voltage: those of the lower one, as a start
+            if not known.any() and k == 0:  # no film: a step of a search that is not taken
+                level[:] = 0.0
+                self.none = True
+            elif not known.any():  # no state at this voltage: those of the lower one, as a start
                 level[:] = table[k - 1]
             elif not known.all():  # beyond the last state: the last one's, as a start
                 level[:] = level[known][
@@ -80,6 +84,8 @@ class Relaxed:
         return found
 
     def _of(self, h: Array, voltage: Array) -> Array:
+        if self.none:
+            return np.full((h.size, self.splines[0].c.shape[-1]), np.nan)
         if len(self.splines) == 1:
             alone: Array = self.splines[0](h)
             return alone

@@ -125,6 +125,14 @@ def test_a_film_that_hangs_slack_at_the_highest_voltage_has_a_response_all_the_s
     assert np.array_equal(moved.weight, still.weight)
 
 
+def test_a_film_without_any_state_has_no_force_and_raises_nothing() -> None:
+    """A step of a search may ask for one: it is not taken."""
+    wild = Specimen(6e-3, 20e-3, 500e-6, 3.0, Material("wild", (1e300,), (900.0,), 3.0))
+    found = Relaxed(wild, 10e-3, 2000.0)(np.linspace(0.0, 10e-3, 5), np.zeros(5))
+    assert np.isnan(found["force"]).all()
+    assert found["mu"].shape == (5, 1)
+
+
 def test_an_elastic_fit_imports_nothing_of_branches() -> None:
     code = (
         "import sys, calibration.film.identify, calibration.film.summary, rig.analysis.film;"
