@@ -12,7 +12,7 @@ import pytest
 from calibration.film.identify import identify
 from calibration.film.propagation import secant_modulus as model_secant_modulus
 from calibration.film.result import Suspect
-from tests.calibration.film.imperfections import IMPERFECTIONS, Imperfection, experiment
+from tests.calibration.film.imperfections import FINE, IMPERFECTIONS, Imperfection, experiment
 from tests.calibration.film.independent import ONE_TERM, measured, secant_modulus
 from tests.calibration.film.independent import STATED as LOOSE
 from tests.calibration.film.shooting import Cone
@@ -96,6 +96,19 @@ def test_an_imperfection_of_twice_the_size_that_shows_is_named(name: str, suspec
         quantity = found.quantities[quantity_name]
         assert quantity.verdict != "identified"
         assert abs(quantity.value - truth) < 3.0 * quantity.uncertainty
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tau", "size"), [(1.0, 0.02), (30.0, 0.02), (300.0, 0.1)])
+def test_the_size_of_a_viscous_suspect_is_that_of_the_films_branch(tau: float, size: float) -> None:
+    """A branch of finite elements that share nothing with the model, and a load cell that tells its time."""
+    name = f"viscous film with a relaxation time near {tau:g} s"
+    made = called(name).make(size)
+    found = identify(measured(np.random.default_rng(3), stated=EXACT, errors={}, noise=FINE, **made), terms=1, starts=1)
+    (mine,) = (one for one in found.suspects if one.name == name)
+    assert found.likely[0] == name
+    assert mine.uncertainty < 0.1 * size
+    assert mine.amplitude == pytest.approx(size, abs=3.0 * mine.uncertainty + 0.1 * size)  # of the first order
 
 
 @pytest.mark.slow

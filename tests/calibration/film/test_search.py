@@ -213,8 +213,8 @@ def test_a_viscous_film_is_named_with_its_time(experiment: Experiment, relaxed: 
     assert first.significant
     assert first.name == "viscous film with a relaxation time near 10 s"
     # The record's rule is a hereditary one, of the elastic force: a branch at rest in the pre-stretched film, which the
-    # suspect is, would have to be two to four times as stiff (test_branches.py has films of that law).
-    assert 0.1 < first.amplitude < 0.2
+    # suspect is, would have to be several times as stiff (test_independent.py has films of that law).
+    assert 0.1 < first.amplitude < 0.3
     assert any("relaxation time near 10 s" in words for words in found.warnings)
     assert found.to_dict()["lack_of_fit"]["suspects"][0]["name"] == first.name
 
