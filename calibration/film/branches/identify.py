@@ -252,7 +252,9 @@ class _Found:
         for k, one in enumerate(self.film.branches):
             units = np.eye(x.size)[[n + k, n + count + k]]
             ratio, log_time = (math.hypot(*self.budget(unit).values()) for unit in units)
-            found.append(FoundBranch.judged(one.ratio, ratio, one.time, log_time, self.joint.window))
+            found.append(
+                FoundBranch.judged(one.ratio, ratio, one.time, log_time, self.joint.window, self.tried[-1].held_out)
+            )
         return tuple(sorted(found, key=lambda one: one.time))
 
     def softening(self) -> tuple[Softening, ...]:

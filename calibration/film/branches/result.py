@@ -15,6 +15,7 @@ from calibration.film.result import Quantity, finite, quantity_dict
 Array = NDArray[np.float64]
 
 KNOWN_RATIO, KNOWN_TIME = 0.15, 0.3  # relative standard uncertainties up to which a branch is identified
+EXPLAINED = 1.5  # times its noise, up to which what was left out of the fit has to be predicted
 EDGE = 0.1  # of the logarithm of a time, from the end of the window
 HOLD = 1.2  # times a relaxation time, that a film is held to see it
 USUAL, FAR = 0.1, 0.5  # ratio of a branch that occurs; one that would not show below this ratio does not show
@@ -37,13 +38,23 @@ class FoundBranch:
 
     @classmethod
     def judged(
-        cls, ratio: float, ratio_uncertainty: float, time: float, time_relative: float, window: tuple[float, float]
+        cls,
+        ratio: float,
+        ratio_uncertainty: float,
+        time: float,
+        time_relative: float,
+        window: tuple[float, float],
+        held_out: float,
     ) -> FoundBranch:
-        """With its verdict and limits, from standard uncertainties and the times that the record can show (s)."""
+        """With its verdict and limits, from standard uncertainties and the times that the record can show (s).
+
+        ``held_out`` is that of the fit: where it does not predict what was left out, a further branch that the record
+        cannot tell apart may stand behind this one.
+        """
         low, high = window
         if not math.log(low) + EDGE < math.log(time) < math.log(high) - EDGE:
             word = "outside the window"
-        elif ratio_uncertainty <= KNOWN_RATIO * ratio and time_relative <= KNOWN_TIME:
+        elif held_out <= EXPLAINED and ratio_uncertainty <= KNOWN_RATIO * ratio and time_relative <= KNOWN_TIME:
             word = "identified"
         else:
             word = "bounded"
@@ -148,6 +159,12 @@ class Spectrum:
             words.append(
                 f"branch: ratio {one.ratio:.3g} +- {one.ratio_uncertainty:.1g}, time {one.time:.3g} s (95 %: {low:.3g} "
                 f"to {high:.3g} s): {one.verdict}"
+            )
+        if self.branches and self.counts[-1].held_out > EXPLAINED:
+            words.append(
+                f"parts of the record that were left out are predicted to {self.counts[-1].held_out:.1f} times their "
+                "noise only: a further branch that this record cannot tell apart may stand behind those found, so that "
+                "none counts as identified; move faster, and hold longer"
             )
         if not self.branches:
             words.append("no branch is needed to explain this record")

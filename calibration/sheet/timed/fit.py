@@ -134,7 +134,11 @@ class _Found:
         for k in range(ratio.size):
             units = np.eye(x.size)[[problem.numbers + k, problem.numbers + ratio.size + k]]
             errors = [math.hypot(*self.budget(unit).values()) for unit in units]
-            found.append(FoundBranch.judged(float(ratio[k]), errors[0], float(time[k]), errors[1], problem.window))
+            found.append(
+                FoundBranch.judged(
+                    float(ratio[k]), errors[0], float(time[k]), errors[1], problem.window, self.tried[-1].held_out
+                )
+            )
         return tuple(sorted(found, key=lambda one: one.time))
 
     def spectrum(self) -> Spectrum:
