@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.electrical.charge import NotResolved
 from calibration.electrical.rows import Currents
 from calibration.film.differences import DIMENSIONS
 from model.material.materials import Material
@@ -23,6 +24,7 @@ from model.specimen import Specimen
 Array = NDArray[np.float64]
 
 STEP = 2e-3  # relative, of what the capacitance is differentiated by
+LEAST = 1e-3  # of the shear modulus: a smaller modulus changes as if it were so large
 STEP_M = 1e-5  # of the displacement
 KINDS = {"current_gain": "1", "cable": "F", "current_step": "A"}  # errors that all readings share, and their unit
 
@@ -43,14 +45,19 @@ class Evaluated:
 
 
 class ChargeModel:
-    """The capacitances of a film near ``at``, held against currents; ``whole`` False leaves out what the law does."""
+    """The capacitances of a film near ``at``, held against currents; ``whole`` False leaves out what the law does.
+
+    Places without a state of the film are left out, ``left_out`` of them. Raises `NotResolved` where the others do not
+    tell the capacitance.
+    """
 
     def __init__(self, currents: Currents, at: Material, *, whole: bool = True) -> None:
         specimen = currents.specimen.with_material(at)
         at_once = _capacitances(currents, specimen)
         lost = np.asarray(~np.isfinite(at_once).all(axis=1))
-        if lost.any():
-            currents, at_once = currents.without(lost), at_once[~lost]
+        self.left_out = int(np.count_nonzero(lost))
+        if self.left_out:
+            currents, at_once = _without(currents, lost, at), at_once[~lost]
         self.currents, self.at, self.specimen = currents, at, specimen
         self.per_eps = at_once / at.eps_r  # F, (P, N)
         self.whole = whole
@@ -74,11 +81,11 @@ class ChargeModel:
             values = getattr(self.at, name)
             sides = []
             for k, value in enumerate(values):
-                change = STEP * abs(value)
+                change = STEP * max(abs(value), LEAST * self.at.shear_modulus if name == "mu" else LEAST)
                 moved = (*values[:k], value + change, *values[k + 1 :])
                 film = replace(self.at, mu=moved) if name == "mu" else replace(self.at, alpha=moved)
                 sides.append(slope(film, change))
-            by.append(np.stack(sides, axis=-1))
+            by.append(np.stack(sides, axis=-1) if sides else np.zeros((*self.per_eps.shape, 0)))
         change = -STEP * self.at.eps_r  # towards the film that surely holds the voltage
         return by[0], by[1], slope(replace(self.at, eps_r=self.at.eps_r + change), change)
 
@@ -146,6 +153,19 @@ class ChargeModel:
         by_voltage = np.nan_to_num(eps * self.per_eps - fewer) / STEP  # at a voltage that is higher by 1, relative
         found["voltage"] = self.project(eps * self.per_eps + self.currents.known.cable_F + by_voltage)
         return found
+
+
+def _without(currents: Currents, lost: NDArray[np.bool_], film: Material) -> Currents:
+    """Currents without the places that are lost, where the film has no state."""
+    try:
+        return currents.without(lost)
+    except NotResolved as error:
+        raise NotResolved(
+            f"a film with eps_r = {film.eps_r:.3g} and a shear modulus of {film.shear_modulus:.3g} Pa has no state at "
+            f"the voltages of the currents in {np.count_nonzero(lost)} of {lost.size} displacements, and the others do "
+            "not tell the capacitance. Correct eps_r or the moduli of the material in the scene, which the fit begins "
+            "with, or fit without the charge"
+        ) from error
 
 
 def _capacitances(currents: Currents, specimen: Specimen, *, more: float = 0.0, factor: float = 1.0) -> Array:

@@ -136,9 +136,8 @@ def identify(
     strange = [key for key in along if key not in choice]
     if strange:
         raise IdentificationError(f"cannot fit {', '.join(strange)} along; what can be is {', '.join(sorted(choice))}")
-    if currents is not None and _repeated(curves):
-        along = [*along, SOFTENING]
     asked = [choice[key] for key in dict.fromkeys(along)]
+    more = [choice[SOFTENING]] if currents is not None and SOFTENING not in along else []
 
     if "eps_r" in held:
         guess = replace(guess, eps_r=held["eps_r"])
@@ -155,7 +154,7 @@ def identify(
                 material,
                 tolerance=SEARCH_TOLERANCE,
                 wrinkling=wrinkling,
-                along=asked,
+                along=[*asked, *(more if _repeated(curves, selections) else [])],
                 currents=currents,
                 coarse=True,
             )
@@ -172,7 +171,7 @@ def identify(
             nodes=nodes,
             wrinkling=wrinkling,
             compliance=best.compliance,
-            along=asked,
+            along=[*asked, *(more if _repeated(curves, selections) else [])],
             currents=currents,
         )
         best = polish(problem, best, held) or best
@@ -187,6 +186,11 @@ def identify(
         notes.append("the set of samples at which the film is taut did not settle while fitting")
     best = confirm(problem, best, held)
     notes += other_minima(fits)
+    if problem.charge is not None and problem.charge.left_out:
+        places = problem.charge.left_out + len(problem.charge.currents.places)
+        notes.append(
+            f"the currents at {problem.charge.left_out} of {places} displacements were left out: no state there"
+        )
     record = {
         "data": dict(provenance or {}),
         "settings": {
@@ -198,7 +202,7 @@ def identify(
             "profiles": profiles,
             "fixed": held,
             "wrinkling": wrinkling,
-            "along": [kind.key for kind in asked],
+            "along": list(problem.along),
             "fixed_stretch": None if fixed_stretch is None else list(fixed_stretch),
             **({"charge": True} if currents is not None else {}),
         },
@@ -219,10 +223,11 @@ def _settled(problem: Problem, film: Material) -> bool:
     return problem.charge is None or problem.charge.off(film) < CHARGE_OFF
 
 
-def _repeated(curves: Sequence[Curve]) -> bool:
-    """Whether some run has two curves."""
-    runs = [curve.run for curve in curves if curve.usable.any()]
-    return len(set(runs)) < len(runs)
+def _repeated(curves: Sequence[Curve], selections: Sequence[Selection]) -> bool:
+    """Whether some run has two curves of which samples are used, and one that is used is under voltage."""
+    used = [curve for curve, selection in zip(curves, selections, strict=True) if selection.parts]
+    electric = any(curve.nominal_voltage != 0.0 for curve in used)
+    return electric and len({curve.run for curve in used}) < len(used)
 
 
 def _same(before: Sequence[Selection], after: Sequence[Selection]) -> bool:

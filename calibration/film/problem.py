@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.electrical.charge import NotResolved
 from calibration.electrical.rows import Currents
 from calibration.film.charged import KINDS, ChargeModel
 from calibration.film.coordinates import Coordinates
@@ -126,7 +127,10 @@ class Problem:
         self.coordinates = here = Coordinates.of(at, terms, self.electric)
         self.law, self.moduli, self.film_numbers = here.law, here.moduli, here.film_numbers
         self.parameters, self.material, self.scale = here.parameters, at, here.scale
-        self.charge = None if currents is None or not self.electric else ChargeModel(currents, at, whole=not coarse)
+        try:
+            self.charge = None if currents is None or not self.electric else ChargeModel(currents, at, whole=not coarse)
+        except NotResolved as error:
+            raise IdentificationError(str(error)) from error
         self.nodes = np.array([chebyshev_nodes(part.low, part.high, nodes) for _, part in self.pieces])
         self.voltage = np.array([reference_voltage(curves[i], part.used) for i, part in self.pieces])
         self.nuisances = self._nuisances()

@@ -41,6 +41,21 @@ def identify_with_charge(paths: Sequence[Path], **settings: Any) -> Found:
     except NotResolved as error:
         return _without(identify_logs(paths, **settings), f"{paths[0]}: {error}")
     found = identify_logs(paths, currents=currents, **settings)
+    film = found.identification.material
+    alone = _by_charge([replace(one, specimen=one.specimen.with_material(film)) for one in data], known)
+    if found.identification.charge is None:
+        return _without(found, "no force curve under voltage is used, so the forces do not tell eps_r", alone)
+    by_force, why = _by_force(paths, found, settings)
+    both = ByCharge(alone, by_force)
+    words = [*why, found.identification.charge.words]
+    said = [one for one in words if one not in found.identification.warnings]
+    return replace(found, charge=both, notes=[*found.notes, *said, *_remarks(both)])
+
+
+def _by_force(
+    paths: Sequence[Path], found: Found, settings: dict[str, Any]
+) -> tuple[tuple[float, float] | None, list[str]]:
+    """eps_r by the forces alone with its standard uncertainty, or why there is none."""
     alone = {
         "comparing": False,
         "profiles": False,
@@ -50,24 +65,22 @@ def identify_with_charge(paths: Sequence[Path], **settings: Any) -> Found:
         "near": (found.identification.material,),
         "along": [key for key in settings.get("along", ()) if key != SOFTENING],
     }
-    by_force = identify_logs(paths, **{**settings, **alone}).identification.quantities.get("eps_r")
-    film = found.identification.material
-    shaped = [replace(one, specimen=one.specimen.with_material(film)) for one in data]
-    other = None if by_force is None or not by_force.uncertainty < math.inf else (by_force.value, by_force.uncertainty)
-    both = ByCharge(_by_charge(shaped, known), other)
-    words = [] if found.identification.charge is None else [found.identification.charge.words]
-    said = [one for one in words if one not in found.identification.warnings]
-    return replace(found, charge=both, notes=[*found.notes, *said, *_remarks(both)])
+    try:
+        one = identify_logs(paths, **{**settings, **alone}).identification.quantities.get("eps_r")
+    except DataError as error:
+        return None, [f"no permittivity by the force alone: {error}"]
+    return (None if one is None or not one.uncertainty < math.inf else (one.value, one.uncertainty)), []
 
 
-def _without(found: Found, why: str) -> Found:
-    """A result by the force alone, where the charge was asked for and cannot be told."""
+def _without(found: Found, why: str, alone: Permittivity | None = None) -> Found:
+    """A result by the force alone, where the charge was asked for and is not used; ``alone`` is what it tells."""
     settings = {**found.identification.provenance["settings"], "charge": True}  # so that the fit can be done again
     provenance = {**found.identification.provenance, "settings": settings}
     note = f"{why}. The charge was left out: the fit is by the force alone"
     identification = replace(found.identification, provenance=provenance)
-    charge = ByCharge(None, None, why)
-    return replace(found, identification=identification, charge=charge, notes=[note, *found.notes])
+    told = [] if alone is None else [f"the permittivity by the charge alone is {_stated(alone)}"]
+    charge = ByCharge(alone, None, why)
+    return replace(found, identification=identification, charge=charge, notes=[note, *told, *found.notes])
 
 
 def _by_charge(data: Sequence[Charging], known: Known) -> Permittivity | None:
@@ -82,6 +95,10 @@ def _remarks(both: ByCharge) -> list[str]:
     if charge is None or force is None:
         return []
     return [
-        f"the permittivity by the charge alone is {charge.value:.4g} +- {charge.standard_uncertainty:.2g}, by the "
-        f"force alone, if the film did not soften, {force[0]:.4g} +- {force[1]:.2g}"
+        f"the permittivity by the charge alone is {_stated(charge)}, by the force alone, if the film did not soften, "
+        f"{force[0]:.4g} +- {force[1]:.2g}"
     ]
+
+
+def _stated(found: Permittivity) -> str:
+    return f"{found.value:.4g} +- {found.standard_uncertainty:.2g}"

@@ -115,7 +115,11 @@ class Rise(Action):
 
     def rise_in(self, seconds: float) -> float:
         """By how much (V) the output rises at most in so many ``seconds``: a stair is climbed at the supply's ramp."""
-        return min(self.most * seconds, self.rate * max(seconds, STAIR_S))
+        if math.isnan(seconds):
+            return math.nan
+        whole = math.floor(seconds / STAIR_S)
+        stair = self.rate * STAIR_S
+        return whole * stair + min(stair, self.most * (seconds - whole * STAIR_S))
 
     def _raise(self, rig: Rig) -> Turns:
         start, end = self.voltage

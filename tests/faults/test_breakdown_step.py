@@ -12,6 +12,7 @@ from drivers.roles import HVFlag
 from rig.base.errors import LimitError
 from rig.log.reader import read_log
 from rig.sim.truth import Fault
+from rig.steps.breakdown import Rise
 from tests.protocols import TO_THE_FILM
 
 Tell = Callable[..., Any]  # of conftest.Story
@@ -128,3 +129,14 @@ def test_a_rate_above_the_supplys_and_a_ceiling_below_what_is_on_are_refused(tel
     before = '[[step]]\ndo = "voltage"\nvoltage_V = 1700\n' if not more else ""
     with pytest.raises(LimitError, match="rate_V_per_s" if more else "ceiling_V"):
         tell(protocol=TEST.replace('[[step]]\ndo = "breakdown"', before + '[[step]]\ndo = "breakdown"') + more)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "volts"), [(0.05, 25.0), (0.5, 50.0), (0.55, 75.0), (0.6, 100.0), (1.0, 100.0), (1.02, 110.0)]
+)
+def test_stairs_rise_at_the_ramp_of_the_supply(seconds: float, volts: float) -> None:
+    """Of 100 V/s in stairs of half a second, each climbed at 500 V/s."""
+    plan = {"by": None, "kind": "breakdown", "step": 1, "label": "", "h": (0.0, 0.0), "voltage": (0.0, 1e3)}
+    rise = Rise(**plan, duration=10.0, rate=100.0, most=500.0, hold=0.0)  # type: ignore[arg-type] # by: no step is asked
+    assert rise.rise_in(seconds) == pytest.approx(volts)
+    assert np.isnan(rise.rise_in(float("nan")))

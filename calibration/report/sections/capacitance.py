@@ -16,8 +16,10 @@ def context(data: ReportData) -> Mapping[str, Any] | None:
     if data.charge is None:
         return None
     joint, alone, by_force = data.identification.charge, data.charge.charge, data.charge.by_force
+    told = None if alone is None else both(alone.value, alone.standard_uncertainty)
+    tables = [] if alone is None else _alone(alone)
     if joint is None:
-        return {"left_out": data.charge.left_out, "joint": None, "alone": None}
+        return {"left_out": data.charge.left_out, "joint": None, "alone": told, "by_force": None, "tables": tables}
     capacitances = [
         [f"{c.h * 1e3:.3f}", f"{c.voltage:.0f}", both(c.measured * 1e12, c.standard_uncertainty * 1e12),
          f"{c.fitted * 1e12:.4g}", f"{100.0 * (c.measured / c.fitted - 1.0):+.2f}"]
@@ -32,9 +34,9 @@ def context(data: ReportData) -> Mapping[str, Any] | None:
         "noise": f"{joint.noise * 1e9:.3g}",
         "resolution": f"{joint.resolution * 1e9:.3g}",
         "capacitances": Table(heads, capacitances, "d(CV)/dV of film and cable, leakage taken off"),
-        "alone": None if alone is None else both(alone.value, alone.standard_uncertainty),
+        "alone": told,
         "by_force": None if by_force is None else both(*by_force),
-        "tables": [] if alone is None else _alone(alone),
+        "tables": tables,
     }
 
 
@@ -73,10 +75,10 @@ with a noise of {{ noise }} nA, read in steps of {{ resolution }} nA. {{ words }
 uncertainty by the noise of the current.</figcaption>
 </figure>
 {{ table(capacitances) }}
+{% endif %}
 {% if alone %}<p>The relative permittivity by the charge alone is {{ alone }} (k = 1){% if by_force %}; by the force
 alone, if the film did not soften, {{ by_force }}{% endif %}.</p>{% endif %}
 {% for one in tables %}{{ table(one) }}{% endfor %}
-{% endif %}
 """
 
 SECTION = Section("capacitance", 55, context, TEMPLATE)

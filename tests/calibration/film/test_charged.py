@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
 
 from calibration.electrical.agreement import AGREE, CONTRADICT, PART, SOFTENED, Charged, Difference
-from calibration.electrical.charge import NotResolved
+from calibration.electrical.charge import Charging, Known, NotResolved
 from calibration.electrical.rows import Currents, charge_slope, currents_of
-from calibration.film.identify import identify
+from calibration.film.charged import ChargeModel
+from calibration.film.identify import IdentificationError, identify
 from calibration.film.problem import Problem
 from calibration.film.reduction import select
 from calibration.film.result import Identification
+from model.material.laws import find_law
 from model.material.materials import Material
+from model.specimen import Specimen
 from tests.calibration.film.charged_runs import LEVELS, PLACES_M, Supply, capacitance, experiment
 from tests.calibration.film.independent import ONE_TERM
 from tests.calibration.film.shooting import Cone
@@ -188,3 +192,67 @@ def test_places_are_where_the_voltage_rose() -> None:
     assert len(without.places) == 2
     with pytest.raises(NotResolved, match="rises"):
         currents.without(np.ones(3, dtype=np.bool_))
+
+
+def rising(at: Material, top: float = 800.0) -> Currents:
+    """Currents of a capacitor of 0.6 nF at two displacements, beside which the film ``at`` is put."""
+    t = np.arange(0.0, 10.0, 0.1)
+    volts = np.minimum(200.0 * t, top)
+    current = np.where(volts < top, 0.6e-9 * 200.0, 0.0) + 1e-9 * np.random.default_rng(0).standard_normal(t.size)
+    cone = Cone(**ONE_TERM)  # type: ignore[arg-type] # its fields
+    specimen = Specimen(cone.a, cone.b, cone.thickness, cone.prestretch, at)
+    twice = np.concatenate
+    data = Charging(
+        specimen,
+        twice((t, t + 20.0)),
+        np.tile(volts, 2),
+        np.tile(current, 2),
+        np.repeat((1e-3, 9e-3), t.size),
+        np.tile(volts < top, 2),
+        run="run",
+    )
+    return currents_of([data], Known(0.02, 0.005, 0.01, 0.003))
+
+
+@pytest.mark.parametrize(
+    ("law", "mu"), [("neo_hooke", (1e5,)), ("yeoh", (5e4, 0.0, 0.0)), ("mooney_rivlin", (4e4, 0.0))]
+)
+def test_the_charge_is_linear_in_the_moduli_of_laws_without_shapes(law: str, mu: tuple[float, ...]) -> None:
+    at = Material(name="at", mu=mu, alpha=(), eps_r=1.7, law=find_law(law))
+    model = ChargeModel(rising(at), at)
+    moved = replace(at, mu=tuple(one + 2e-4 * mu[0] for one in mu))
+    change = (
+        model.evaluate([moved], {}, np.zeros((1, 2))).residual - model.evaluate([at], {}, np.zeros((1, 2))).residual
+    )
+    assert model.off(moved) < 0.05 * np.abs(change).max()
+
+
+def test_a_film_without_a_state_at_the_voltages_is_said_with_what_to_do() -> None:
+    at = Material(name="at", mu=(1e5,), alpha=(), eps_r=1.7, law=find_law("neo_hooke"))
+    currents = rising(at, 1500.0)
+    assert ChargeModel(currents, at).left_out == 0
+    with pytest.raises(NotResolved, match=r"no state at the voltages.* in 2 of 2 .*Correct eps_r"):
+        ChargeModel(currents, replace(at, eps_r=300.0))
+
+
+@pytest.mark.slow
+def test_a_permittivity_believed_too_high_is_an_error_of_the_fit() -> None:
+    curves, data, known = experiment(1, errors=EXACT, levels=(0.0, 1500.0))
+    material = replace(curves[0].specimen.material, eps_r=100.0)
+    curves = [replace(one, specimen=one.specimen.with_material(material)) for one in curves]
+    # The curve is under a voltage that the film believed bears, so that only its currents have no state.
+    curves[1] = replace(curves[1], voltage=curves[1].voltage * 1e-3, nominal_voltage=1.5)
+    with pytest.raises(IdentificationError, match="no state at the voltages of the currents"):
+        identify(curves, terms=1, starts=1, currents=currents_of(data, known))
+
+
+@pytest.mark.slow
+def test_a_curve_that_is_left_out_does_not_bring_softening_into_the_fit() -> None:
+    curves, data, known = experiment(1, errors=EXACT, levels=(0.0, 1500.0))
+    currents = currents_of(data, known)
+    high = replace(curves[1], voltage=curves[1].voltage * 20.0, nominal_voltage=3e4)  # no film has a state there
+    found = identify([curves[0], high], terms=1, starts=1, currents=currents)
+    assert found.charge is None and "eps_r" not in found.quantities
+    assert found.provenance["settings"]["along"] == []
+    with pytest.raises(IdentificationError, match="nothing to do with it"):  # who asks for it is told
+        identify([curves[0], high], terms=1, starts=1, currents=currents, along=["softening"])

@@ -6,12 +6,14 @@ import json
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
 from calibration.electrical.agreement import SOFTENED
+from rig.analysis import charged_film
 from rig.analysis.charge import permittivity_of
 from rig.analysis.charged_film import identify_with_charge
 from rig.analysis.film import identify_logs, write_results
@@ -124,6 +126,33 @@ def test_a_supply_that_cannot_resolve_its_current_leaves_the_fit_as_without(swep
     stated = json.loads((tmp_path / "fit.json").read_text())
     assert "cannot resolve" in stated["by_charge_alone"]["left_out"] and "charge" not in stated
     assert "The charge was left out" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_forces_without_voltage_leave_the_charge_alone_and_say_so(swept: Path, tmp_path: Path) -> None:
+    found = identify_with_charge([changed(swept, tmp_path / "passive.mcap", "/phase", _only_passive)], terms=1)
+    assert found.identification.charge is None and "eps_r" not in found.identification.quantities
+    assert found.charge is not None and found.charge.charge is not None
+    assert abs(found.charge.charge.value - TRUTH) < 2 * found.charge.charge.standard_uncertainty
+    assert "no force curve under voltage" in found.notes[0] and "by the charge alone" in found.notes[1]
+    write_results(found, tmp_path / "fit.json", tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "by the force alone: no force curve under voltage" in page
+    assert "The relative permittivity by the charge alone is" in page
+
+
+def _only_passive(fields: dict[str, Any]) -> None:
+    fields["record"] = fields["record"] and fields["voltage_V"] == 0.0
+
+
+def test_a_fit_by_the_force_alone_that_fails_does_not_lose_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise DataError("no sample is left to fit.")
+
+    monkeypatch.setattr(charged_film, "identify_logs", fails)
+    found: Any = SimpleNamespace(identification=SimpleNamespace(material=None))
+    by_force, words = charged_film._by_force([Path("log.mcap")], found, {})
+    assert by_force is None and "no sample is left to fit" in words[0]
 
 
 def _in_steps_of_10_uA(fields: dict[str, Any]) -> None:
