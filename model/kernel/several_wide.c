@@ -1,6 +1,6 @@
 /* several.c once more, for processors of four numbers at once. The digits are the same: lanes never meet, and no
-   operation is contracted. */
-#ifdef __x86_64__
+   operation is contracted. Not with gcc on Windows, which does not align so wide numbers on the stack there. */
+#if defined(__x86_64__) && !(defined(_WIN32) && !defined(__clang__))
 #define LANES 4
 #define SOLVE_SEVERAL solve_several_wide
 #include <cpuid.h>

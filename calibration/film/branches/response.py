@@ -336,11 +336,10 @@ class Response:
 
 def _kind(film: Material) -> Array:
     """What of a film's law its motion depends on: shares of the moduli, shape parameters, permittivity by stiffness."""
-    mu = np.array(film.mu)
-    shares = mu / np.abs(mu).sum()
-    return np.concatenate(
-        (shares, np.log(np.maximum(np.abs(film.alpha), 1e-3)), [math.log(film.eps_r / film.shear_modulus)])
-    )
+    mu, alpha = np.array(film.mu), np.array(film.alpha)
+    shapes = np.log(np.maximum(np.abs(alpha), 1e-3))
+    loaded = math.log(film.eps_r / film.shear_modulus)
+    return np.concatenate((mu / np.abs(mu).sum(), shapes, np.sign(alpha), [loaded]))
 
 
 def _moved(film: Material, number: int) -> tuple[Material, float]:

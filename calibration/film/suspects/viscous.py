@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.film.reduction import interpolation_matrix
 from calibration.film.suspects.base import Context, Kind, Shape
@@ -78,29 +79,36 @@ def _forces(context: Context, run: str, law: Law) -> tuple[Array, Array]:
 
 
 def _path(context: Context, run: str) -> Path:
-    """How the elastic film goes through a run: at `INSTANTS` of its time, and at the ends of its blocks."""
+    """How the elastic film goes through a run: at the samples next to `INSTANTS` of its time and where it turns."""
     l1, l2, _, _ = context.states
     log = np.log(np.stack((l1, l2), axis=2)[..., ::EVERY])  # (rows, nodes, 2, points)
     slope = np.einsum("rij,rjdp->ridp", context.differentiation, log)
+    time, place, block = _samples(context, run)
+    row = np.array(context.block_rows)[block]
     begin, duration = context.runs[run]
-    grid = np.linspace(begin, begin + duration, INSTANTS)
-    parts: list[Path] = []
-    for block, row in zip(context.blocks, context.block_rows, strict=True):
+    near = np.searchsorted(time, np.linspace(begin, begin + duration, INSTANTS)).clip(max=time.size - 1)
+    turns = np.flatnonzero(np.diff(block))[:INSTANTS]  # a block has one direction
+    at = np.unique(np.concatenate((near, turns, turns + 1)))
+    logs, slopes = np.empty((2, at.size, *log.shape[2:]))
+    for one in np.unique(row[at]):
+        mine = row[at] == one
+        matrix = interpolation_matrix(context.nodes[one], place[at[mine]])
+        logs[mine] = np.einsum("nj,jdp->ndp", matrix, log[one])
+        slopes[mine] = np.einsum("nj,jdp->ndp", matrix, slope[one])
+    return time[at], logs, slopes
+
+
+def _samples(context: Context, run: str) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Times of a run's samples, in their order and each once, their displacements and the numbers of their blocks."""
+    times, places, numbers = [], [], []
+    for k, (block, row) in enumerate(zip(context.blocks, context.block_rows, strict=True)):
         curve = context.curves[row]
-        if curve.run != run:
-            continue
-        assert curve.time is not None
-        time = curve.time[block.rows]
-        order = np.argsort(time, kind="stable")
-        first, last = time[order[[0, -1]]]
-        inside = grid[(grid > first) & (grid < last)]
-        at = np.unique(np.concatenate(([first], inside, [last])))
-        matrix = interpolation_matrix(context.nodes[row], np.interp(at, time[order], curve.place[block.rows][order]))
-        parts.append((at, np.einsum("nj,jdp->ndp", matrix, log[row]), np.einsum("nj,jdp->ndp", matrix, slope[row])))
-    times, logs, slopes = (np.concatenate(one) for one in zip(*parts, strict=True))
-    order = np.argsort(times, kind="stable")
-    order = order[np.concatenate(([True], np.diff(times[order]) > 0.0))]
-    return times[order], logs[order], slopes[order]
+        if curve.run == run and curve.time is not None:
+            times.append(curve.time[block.rows])
+            places.append(curve.place[block.rows])
+            numbers.append(np.full(block.rows.size, k, dtype=np.intp))
+    time, first = np.unique(np.concatenate(times), return_index=True)
+    return time, np.concatenate(places)[first], np.concatenate(numbers)[first]
 
 
 def _rest(context: Context, row: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from tests.calibration.film.imperfections import FINE, IMPERFECTIONS, Imperfecti
 from tests.calibration.film.independent import ONE_TERM, measured, secant_modulus
 from tests.calibration.film.independent import STATED as LOOSE
 from tests.calibration.film.shooting import Cone
+from tests.calibration.film.viscous_cone import ViscousCone
 
 NUMERICS = [
     (4e-3, 10e-3, 0.0, 0.2156961965381),
@@ -109,6 +111,31 @@ def test_the_size_of_a_viscous_suspect_is_that_of_the_films_branch(tau: float, s
     assert found.likely[0] == name
     assert mine.uncertainty < 0.1 * size
     assert mine.amplitude == pytest.approx(size, abs=3.0 * mine.uncertainty + 0.1 * size)  # of the first order
+
+
+@pytest.mark.slow
+def test_a_viscous_suspect_knows_of_a_hold_between_moves_of_one_curve() -> None:
+    """Up, held, down, and the same again, at one voltage: a branch of 10 s shows in the holds, as large as it is."""
+    film = ViscousCone(branches=((0.05, 10.0),), **ONE_TERM)
+    bends, way = (0.0, 5.0, 65.0, 70.0, 75.0, 135.0, 140.0), (2e-4, 1e-2, 1e-2, 2e-4, 1e-2, 1e-2, 2e-4)
+    trace = film.history(bends, way, 7 * (0.0,), moves=100)
+    time = np.arange(0.05, 140.0, 0.1)
+    (like, *_) = measured(np.random.default_rng(3), stated=EXACT, errors={}, noise=FINE, voltages=(0.0,))
+    noise = FINE[0] * np.random.default_rng(4).standard_normal(time.size)
+    h = np.interp(time, bends, way)
+    direction = np.select([time % 70.0 < 5.0, time % 70.0 > 65.0], [1, -1]).astype(np.int8)
+    curve = replace(
+        like,
+        h=h,
+        force=np.interp(time, trace.t, trace.force) + noise,
+        voltage=np.zeros(time.size),
+        direction=direction,
+        time=time,
+        flagged=None,
+    )
+    found = identify([curve], terms=1, starts=1)
+    assert found.suspects[0].name == "viscous film with a relaxation time near 10 s"
+    assert found.suspects[0].amplitude == pytest.approx(0.05, rel=0.05)
 
 
 @pytest.mark.slow
