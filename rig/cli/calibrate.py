@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rig.cli.files import FILE, FOLDER, PORTS, nothing_without_a_log, read_ports, tell_written
+from rig.cli.files import CLEAR, FILE, FOLDER, PORTS, nothing_without_a_log, read_ports, tell_written
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports (hv only).")
 @PORTS
 @click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
+@CLEAR
 def command(
     quantity: Quantity,
     source: Path,
@@ -35,6 +36,7 @@ def command(
     arm: bool,
     ports: Path | None,
     yes: bool,
+    clear: bool,
 ) -> None:
     """Calibrate an instrument on the bench of SOURCE, a scene, and write its certificate; or from SOURCE, a log.
 
@@ -58,7 +60,7 @@ def command(
         with _made(out, *wanted):
             found = calibrate(source, quantity)
     else:
-        log = _run(quantity, source, out, protocol, wanted, read_ports(ports), arm=arm, yes=yes)
+        log = _run(quantity, source, out, protocol, wanted, read_ports(ports), arm=arm, yes=yes, clear=clear)
         found = calibrate(log, quantity)
     if quantity != "timing":
         write_text(certificate, certificate_text(found, valid_days))
@@ -79,6 +81,7 @@ def _run(
     *,
     arm: bool,
     yes: bool,
+    clear: bool,
 ) -> Path:
     """Carry the calibration out on the bench of ``scene``; its log. The usual steps are left beside it."""
     from rig.analysis.sensor_protocols import protocol_text
@@ -95,7 +98,7 @@ def _run(
         if protocol is None:
             write_text(steps, text)
         with nothing_without_a_log(log, *made):
-            run_and_tell(prepare(scene, steps, ports), log, arm=arm, yes=yes, take_down=False)
+            run_and_tell(prepare(scene, steps, ports), log, arm=arm, yes=yes, take_down=False, clear=clear)
     return log
 
 

@@ -47,6 +47,9 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
 PORTS = click.option(
     "--ports", type=FILE_OR_STDIN, help="Ports by role as `dea-rig sim` prints them, in place of the scene's."
 )
+CLEAR = click.option(
+    "--clear", is_flag=True, help="Clear what the supply has latched: its cause is removed; default: ask."
+)
 
 
 def read_ports(path: Path | None) -> dict[str, dict[str, Any]] | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from rig.cli.files import FILE, PORTS, read_ports
+from rig.cli.files import CLEAR, FILE, PORTS, read_ports
 
 
 @click.command("resume")
@@ -16,7 +16,7 @@ from rig.cli.files import FILE, PORTS, read_ports
 @click.option("--arm", is_flag=True, help="As for `dea-rig run`.")
 @click.option("--yes", is_flag=True, help="As for `dea-rig run`.")
 @click.option("--take-down", is_flag=True, help="As for `dea-rig run`.")
-@click.option("--clear", is_flag=True, help="As for `dea-rig run`: after a kill under voltage.")
+@CLEAR
 def command(log: Path, out: Path, ports: Path | None, arm: bool, yes: bool, take_down: bool, clear: bool) -> None:
     """Go on with the run in LOG that ended early: its next step, the same specimen, the same instruments."""
     from rig.base.outputs import check_new

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rig.cli.files import FILE, PORTS, read_ports
+from rig.cli.files import CLEAR, FILE, PORTS, read_ports
 
 if TYPE_CHECKING:
     from rig.protocol.experiment import Experiment
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports; the highest voltage is asked for too.")
 @click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
 @click.option("--take-down", is_flag=True, help="Ramp down an output that is found live; default: ask.")
-@click.option("--clear", is_flag=True, help="Clear what the supply has latched: its cause is removed; default: ask.")
+@CLEAR
 def command(
     scene: Path,
     protocol: Path | None,

@@ -13,7 +13,7 @@ from drivers.links.link import DeviceError
 from rig.base.errors import ConfigError, FaultError, RigError
 from rig.base.terminal import tell
 from rig.cli.swapped import others_on_its_ports
-from rig.log.contents import bench_word
+from rig.log.contents import IN_MEMORY, bench_word
 from rig.operator.display import Display
 from rig.operator.notice import tell_end
 from rig.operator.status import Status
@@ -49,16 +49,15 @@ def run_and_tell(
     scene, highest = experiment.scene, experiment.highest_voltage
     kind = experiment.bench
     word = bench_word(kind)
-    consent = None
-    if scene.on_real_ports:
-        if highest > 0 and not arm:
-            raise ConfigError(f"{word}: this run goes up to {highest:g} V. If that is meant, add --arm.")
-        consent = Consent(
-            "--arm on the command line" if arm else "",
-            "--yes on the command line" if yes else "",
-            "--take-down on the command line" if take_down else "",
-            CLEARED if clear else "",
-        )
+    if scene.on_real_ports and highest > 0 and not arm:
+        raise ConfigError(f"{word}: this run goes up to {highest:g} V. If that is meant, add --arm.")
+    in_memory = "" if scene.on_real_ports else IN_MEMORY  # there nobody is asked
+    consent = Consent(
+        in_memory or ("--arm on the command line" if arm else ""),
+        in_memory or ("--yes on the command line" if yes else ""),
+        "--take-down on the command line" if take_down else "",
+        CLEARED if clear else "",
+    )
     begun = False
 
     def show(status: Status) -> None:

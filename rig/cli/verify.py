@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rig.cli.files import FILE, PORTS, POSITIVE, nothing_without_a_log, read_ports
+from rig.cli.files import CLEAR, FILE, PORTS, POSITIVE, nothing_without_a_log, read_ports
 
 if TYPE_CHECKING:
     from rig.analysis.sensors import Quantity
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 @click.option("--arm", is_flag=True, help="Allow high voltage on real ports (hv only).")
 @PORTS
 @click.option("--yes", is_flag=True, help="Answer every question as expected: for unattended simulated benches.")
+@CLEAR
 def command(
-    quantity: Quantity, scene: Path, standard: float, out: Path, arm: bool, ports: Path | None, yes: bool
+    quantity: Quantity, scene: Path, standard: float, out: Path, arm: bool, ports: Path | None, yes: bool, clear: bool
 ) -> None:
     """Daily one-point check: does the sensor still agree with its certificate? Exit code 1 if not."""
     from rig.analysis.certificate_file import certificate_place
@@ -39,7 +40,7 @@ def command(
     check_new(out, steps)
     write_text(steps, verify_text(quantity, loaded, standard))
     with nothing_without_a_log(out, steps):
-        run_and_tell(prepare(scene, steps, given), out, arm=arm, yes=yes, take_down=False)
+        run_and_tell(prepare(scene, steps, given), out, arm=arm, yes=yes, take_down=False, clear=clear)
     found = judge(out, quantity)
     factor, unit = (1e3, "mm") if found.unit == "m" else (1.0, found.unit)
     click.echo(

@@ -167,7 +167,10 @@ class Recorder:
         self._write("/event", self._clock.now(), severity=severity, source=source, message=message)
 
     def operator(self, act: str, text: str, by: str) -> None:
-        """Write an act of the operator: "is asked", "answers", "pauses", "continues", "stops", "arms"."""
+        """Write an act of the operator.
+
+        "is asked", "answers", "pauses", "continues", "stops", "arms", "may be cleared".
+        """
         self._write("/operator", self._clock.now(), act=act, text=text, by=by)
 
     def identity(self, device: str, identity: Identity, settings: Mapping[str, str]) -> None:

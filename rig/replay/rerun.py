@@ -22,7 +22,7 @@ from rig.replay.recording import OperatorAct, Recording
 from rig.replay.steering import NANOSECONDS, SteeredBench
 from rig.replay.verify import GUARDED
 from rig.steps.advisor import Advice, Ask
-from rig.steps.output import CLEARED
+from rig.steps.output import CLEARED, MAY_CLEAR
 
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
@@ -154,7 +154,9 @@ class _Operator(Control):
         )
         super().__init__(unattended=AS_RECORDED if nobody else "")
         self.took_down = any((c["device"], c["command"]) == ("hv", "take_down") for c in given)
-        self.cleared = any((c["device"], c["command"], c["argument"]) == ("hv", "clear", CLEARED) for c in given)
+        self.cleared = any(act.what == MAY_CLEAR for act in acts) or any(
+            (c["device"], c["command"], c["argument"]) == ("hv", "clear", CLEARED) for c in given
+        )
         self._questions, self._answers = deque(asked), deque(answered)
         self._coming: OperatorAct | None = None  # the answer to the question that is open
         self._wishes = deque(act for act in acts if act.what in ("pauses", "continues"))

@@ -13,6 +13,7 @@ from rig.steps.rig import Rig
 from rig.steps.turns import wait
 
 CLEARED = "--clear on the command line"  # as the log has it
+MAY_CLEAR = "may be cleared"  # the operator's act
 
 
 def ramp_to(rig: Rig, target: float, limit: float) -> Turns:
@@ -52,37 +53,59 @@ def confirm_voltage(rig: Rig) -> Turns:
 def _clear_faults(rig: Rig) -> Turns:
     """What the supply has latched (an earlier emergency off, a trip) is cleared only when the operator says so.
 
-    What he said when he started the run holds once: what latches later has another cause.
+    What he said when he started the run holds once, and of what the supply showed then: what latches later has another
+    cause.
     """
     guard = rig.guard
     said, rig.clear = rig.clear, ""
     if guard is None or guard.last is None or not guard.last.flags & TRIP:
         return
+    flags = guard.last.flags & TRIP
+    if flags & ~rig.latched_at_start:
+        said = ""
     if not said:
         if rig.control.unattended:
-            raise _latched(guard.last.flags & TRIP)
-        words = f"hv: the supply has latched: {flag_names(guard.last.flags & TRIP)}. Cause found and removed?"
+            raise _latched(rig, flags)
+        words = f"hv: the supply has latched: {flag_names(flags)}. Cause found and removed?"
         said = str((yield from rig.ask(Question(words, expected="clear"))))
     guard.clear_faults(said)
+    rig.latched_at_start = HVFlag(0)
+    rig.event("hv", f"cleared by {said}: {flag_names(flags)}")
     last = guard.last
-    yield from wait(rig, lambda: guard.last is not last and guard.last is not None, ALLOWED_S, "A new measurement")
+
+    def gone() -> bool:  # the next sample may have been on its way when it was cleared
+        return guard.last is not last and guard.last is not None and not guard.last.flags & TRIP
+
+    yield from wait(rig, gone, ALLOWED_S, f"hv: the end of {flag_names(flags)} after it was cleared")
 
 
 def refuse_latched(rig: Rig) -> None:
-    """Where nobody can say that the cause is removed, a run with voltage ends before anything moves."""
+    """Where nobody can say that the cause is removed, a run with voltage ends before anything moves.
+
+    Where the operator said it when he started the run, it is noted of what he said it; of nothing, it holds no longer.
+    """
     guard = rig.guard
-    if guard is None or guard.last is None or rig.highest_voltage == 0.0 or rig.clear or not rig.control.unattended:
+    if guard is None or guard.last is None or rig.highest_voltage == 0.0:
         return
-    if guard.last.flags & TRIP:
-        raise _latched(guard.last.flags & TRIP)
+    rig.latched_at_start = guard.last.flags & TRIP
+    if not rig.latched_at_start:
+        rig.clear = ""
+    elif rig.clear:
+        rig.recorder.operator(MAY_CLEAR, flag_names(rig.latched_at_start), rig.clear)
+    elif rig.control.unattended:
+        raise _latched(rig, rig.latched_at_start)
 
 
-def _latched(flags: HVFlag) -> FaultError:
+def _latched(rig: Rig, flags: HVFlag) -> FaultError:
+    later = flags & ~rig.latched_at_start
+    when = f"during this run: {flag_names(later)}" if later else f"from before this run: {flag_names(flags)}"
+    killed = ""
+    if not later and HVFlag.EMERGENCY_OFF in flags:
+        killed = "A run that was killed under voltage leaves an emergency off: its guard did that. "
     return FaultError(
-        f"hv: the supply has latched from before this run: {flag_names(flags)}. A run that was killed under voltage "
-        "leaves an emergency off: its guard did that. Nobody is there to say that the cause is found and removed, so "
-        "nothing was cleared and no voltage given; the output is off. When it is removed, give the same command with "
-        "--clear; or without --yes, and answer the question."
+        f"hv: the supply has latched {when}. {killed}Nobody is there to say that the cause is found and removed, so "
+        "nothing was cleared, and no voltage was given since; the output is off. When it is removed, give the same "
+        "command with --clear; on ports you can also leave out --yes, and answer the question."
     )
 
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 
-from drivers.roles import Sample
+from drivers.roles import HVFlag, Sample
 from rig.base.errors import FaultError
 from rig.bench.bench import Bench
 from rig.log.recorder import Gains, Recorder
@@ -59,6 +59,8 @@ class Rig:
         ``on_readings(role, readings)`` is told the readings of an unloaded sensor.
     advisor : Advisor or None
         Who fits for a closed loop.
+    latched_at_start : HVFlag
+        What the supply had latched before anything moved: of that, and of nothing later, ``clear`` was said.
     doing : str
         What a step adds to its label on the status line.
     counts : dict
@@ -90,6 +92,7 @@ class Rig:
         self.highest_voltage = highest_voltage
         self.take_down = take_down
         self.clear = clear
+        self.latched_at_start = HVFlag(0)
         self.guard: AnyGuard | None = None
         self.force_noise = math.nan
         self.question_number = ""  # which of the plan's questions is asked next ("3 of 34")

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 from rig.base.errors import FaultError, Stopped
+from rig.cli.app import main
 from rig.log.dataset import load_run
 from rig.log.reader import read_log
 from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
 from rig.steps.output import CLEARED
+from tests.faults.conftest import SCENES
+from tests.protocols import TO_THE_FILM, near
 
 Tell = Callable[..., Any]  # of conftest.Story
 LIVE = ("[simulation.hv]", "[simulation.hv]\nstart_live_V = 500.0")
@@ -253,3 +258,74 @@ def test_what_the_supply_has_latched_is_cleared_only_when_the_operator_says_so(t
     assert "the supply has latched: inhibited" in asked[0] and asked[1].startswith("High voltage up to 1000 V")
     assert story.control_words[:2] == ["clear", "arm"]
     assert story.outcome.status == "complete", story.outcome.reason
+
+
+LATER = '[[simulation.fault]]\nrole = "hv"\nkind = "inhibit"\nat_s = 2.5\nduration_s = 0.01\n'
+"""An interlock that is open for a moment, in a run that the supply began clean."""
+
+
+def test_what_latches_before_the_lid_is_closed_is_not_cleared_by_what_was_said_at_the_start(tell: Tell) -> None:
+    story = tell(replace=("[simulation.film]", f"{LATER}[simulation.film]"), protocol=ASKING, clear=CLEARED)
+    assert story.outcome.status == "fault" and story.outcome.safe
+    assert "has latched during this run: inhibited" in story.outcome.reason
+    assert story.bench.world.stage.at(story.end)[0] > 0.0 and not {"clear", "arm"} & set(story.control_words)
+    assert max(abs(volts) for _, volts in story.outputs) < 1.0
+    flags = read_log(story.log).columns("/hv/sample")["flags"]
+    assert flags[0] == 0 and flags[-1] != 0  # it still has it
+
+
+def test_somebody_there_is_asked_about_what_has_latched_beside_that(tell: Tell) -> None:
+    """He closes the interlock, which somebody else has opened, before he answers."""
+    asked: list[str] = []
+
+    def script(control: Control) -> list[str]:
+        if control.question is not None and control.answer is None:
+            asked.append(control.question.text)
+        return answers(control) if not asked or "latched" not in asked[-1] or len(asked) > 100 else []
+
+    faults = OPEN_ONCE + LATER.replace("inhibit", "interlock").replace("0.01", "3.0")
+    control = Control([Operator(script)])
+    story = tell(
+        control=control, replace=("[simulation.film]", f"{faults}[simulation.film]"), protocol=ASKING, clear=CLEARED
+    )
+    assert story.outcome.status == "complete", story.outcome.reason
+    assert asked[0] == "Close the lid" and asked[1].startswith("hv: the supply has latched: ")
+    assert "interlock open" in asked[1] and commands(story)[:4] == ["asked", "asked", "clear", "asked"]
+    assert "clear" not in commands(story)[4:] and said_in(story, "cleared by 'clear', by a person: ")
+
+
+IN_MEMORY = (
+    TO_THE_FILM
+    + """[[step]]
+do = "voltage"
+voltage_V = 300
+[[step]]
+do = "return"
+"""
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["asked for", "not asked for", "ended before"])
+def test_in_memory_it_is_cleared_when_asked_for_and_the_replay_is_the_same(tmp_path: Path, case: str) -> None:
+    """Also of a run that somebody had to touch first, and that ended before it was cleared."""
+    faults, first, asked = OPEN_ONCE, "", [] if case == "not asked for" else ["--clear"]
+    if case == "ended before":
+        faults += '[[simulation.fault]]\nrole = "stage"\nkind = "silent"\nat_s = 2.5\n'
+        first = '[[step]]\ndo = "prompt"\ntext = "Close the lid"\n'
+    text = near((SCENES / "cone-4mm.toml").read_text()).replace("../calibrations", str(SCENES.parent / "calibrations"))
+    scene, steps, log = tmp_path / "scene.toml", tmp_path / "steps.toml", tmp_path / "run.mcap"
+    scene.write_text(text.replace("[simulation.film]", f"{faults}[simulation.film]"))
+    steps.write_text(f'title = "One voltage"\n{IN_MEMORY.replace(TO_THE_FILM, TO_THE_FILM + first)}')
+    done = CliRunner().invoke(main, ["run", str(scene), str(steps), "-o", str(log), *asked])
+    told = [m.fields for m in read_log(log).messages("/command") if m.fields["device"] == "hv"]
+    volts = read_log(log).columns("/hv/sample")["voltage_V"]
+    if case == "asked for":
+        assert done.exit_code == 0, done.output
+        assert (told[0]["command"], told[0]["argument"]) == ("clear", CLEARED) and max(volts) > 290.0
+    else:
+        advised = "give the same command with --clear" in done.output
+        assert done.exit_code == 4 and advised is (case == "not asked for"), done.output
+        assert "clear" not in [row["command"] for row in told] and max(abs(volts)) < 5.0
+    again = CliRunner().invoke(main, ["replay", "--rerun", str(log)])
+    assert again.exit_code == 0, again.output
