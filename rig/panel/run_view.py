@@ -95,7 +95,8 @@ class RunView:
         self._error = ""
         self._closing = threading.Event()
         self._take(self._follower.read())
-        threading.Thread(target=self._watch, name="panel: log", daemon=True).start()
+        self._reading = threading.Thread(target=self._watch, name="panel: log", daemon=True)
+        self._reading.start()
         threading.Thread(target=self._ask, name="panel: run", daemon=True).start()
 
     # Threads -------------------------------------------------------------------------------------------------
@@ -105,7 +106,7 @@ class RunView:
         while not self._closing.wait(LOOK_S):
             try:
                 news = self._follower.read()
-                while news.more:
+                while news.more and not self._closing.is_set():
                     self._take(news)
                     news = self._follower.read()
                 self._take(news)
@@ -415,6 +416,7 @@ class RunView:
 
     def close(self) -> None:
         self._closing.set()
+        self._reading.join()  # nobody reads from a file that is closed
         with suppress(OSError):
             self._follower.close()
 
