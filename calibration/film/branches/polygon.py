@@ -114,9 +114,9 @@ def _few_bends(t: Array, values: Array, allowed: float) -> list[int]:
 
 def _bends(t: Array, values: Array, allowed: float) -> list[int]:
     """Ends and bends of the polygon that no value is farther off than ``allowed`` (Ramer, Douglas and Peucker)."""
-    found, todo = [0, t.size - 1], [(0, t.size - 1)]
-    while todo:
-        left, right = todo.pop()
+    found, spans = [0, t.size - 1], [(0, t.size - 1)]
+    while spans:
+        left, right = spans.pop()
         if right - left < 2:
             continue
         part = slice(left, right + 1)
@@ -125,7 +125,7 @@ def _bends(t: Array, values: Array, allowed: float) -> list[int]:
         worst = left + int(off.argmax())
         if off[worst - left] > allowed and left < worst < right:
             found.append(worst)
-            todo += [(left, worst), (worst, right)]
+            spans += [(left, worst), (worst, right)]
     return found
 
 
