@@ -127,7 +127,11 @@ def test_the_commands_for_emergencies_load_the_control_channel_and_nothing_else(
 
 @pytest.mark.slow
 def test_they_and_the_help_cost_at_most_half_as_much_again_as_the_version(tmp_path: Path) -> None:
-    """CPU time of whole processes, the least of several: what else the machine does counts little."""
+    """CPU time of whole processes, the least of several, in alternation: what else the machine does meets all alike.
+
+    A disturbed process only costs more, so the least comes down to what is true with more rounds: it ends as soon as
+    it holds, after three rounds at least.
+    """
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
 
     def cost(word: str) -> float:
@@ -137,6 +141,9 @@ def test_they_and_the_help_cost_at_most_half_as_much_again_as_the_version(tmp_pa
         return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
     words = ("--version", "--help", "stop", "pause", "continue")
-    least = {word: min(cost(word) for _ in range(7)) for word in words}
-    for word in words[1:]:
-        assert least[word] <= 1.5 * least["--version"], least
+    least = dict.fromkeys(words, float("inf"))
+    for done in range(1, 31):
+        least = {word: min(least[word], cost(word)) for word in words}
+        if done >= 3 and max(least.values()) <= 1.5 * least["--version"]:
+            return
+    pytest.fail(f"CPU time in s: {least}")
