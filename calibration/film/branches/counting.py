@@ -15,7 +15,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.result import FAR
+from calibration.film.branches.result import FAR, LeftOut
 
 Array = NDArray[np.float64]
 
@@ -78,12 +78,12 @@ P = TypeVar("P", bound=Fitted)
 
 @dataclass(frozen=True, eq=False)
 class Count(Generic[P]):
-    """A number of branches, fitted: AICc over its least, root mean square of what was left out over its noise."""
+    """A number of branches, fitted: AICc over its least, and how it predicts what is left out."""
 
     branches: int
     point: P
     aicc: float
-    held_out: float
+    left_out: LeftOut
 
 
 def free_columns(problem: Problem, point: Fitted) -> NDArray[np.bool_]:
@@ -125,26 +125,41 @@ def aicc(problem: Problem, point: Fitted, scale: float) -> float:
     return point.cost / scale + 2.0 * fitted + crowding
 
 
-def held_out(problem: Problem, point: Fitted) -> float:
-    """Root mean square over noise of what a fit without it says of each part of the records (to first order)."""
-    columns, total = point.jacobian[:, free_columns(problem, point)], 0.0
+def left_out(problem: Problem, point: Fitted) -> LeftOut:
+    """How a fit to the rest predicts each part of the records in turn (to first order)."""
+    columns = point.jacobian[:, free_columns(problem, point)]
+    norms = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(norms > 0.0, norms, 1.0)
     stretches = problem.stretches
     kept = stretches >= 0
     order = np.unique(stretches[kept])
-    for mine in np.array_split(order, min(GROUPS, order.size)):
+    parts = np.array_split(order, min(GROUPS, order.size))
+    _, rank, whole = _least(columns, point.residual)
+    total, found = 0.0, []
+    for mine in parts:
         out = np.zeros(point.residual.size, dtype=np.bool_)
         out[: stretches.size] = np.isin(stretches, mine)
-        step = np.linalg.lstsq(columns[~out], -point.residual[~out], rcond=1e-10)[0]
+        step, known, rest = _least(columns[~out], point.residual[~out])
         there = point.residual[out] + columns[out] @ step
         total += float(there @ there)
-    return math.sqrt(total / int(kept.sum()))
+        freedom = max(1, int(out.sum()) - (rank - known))
+        found.append((freedom, max(0.0, whole - rest)))
+    return LeftOut.judged(math.sqrt(total / int(kept.sum())), found)
+
+
+def _least(columns: Array, residual: Array) -> tuple[Array, int, float]:
+    """The least-squares step, how many directions it takes, and chi-square after it."""
+    found, _, rank, _ = np.linalg.lstsq(columns, -residual, rcond=1e-10)
+    step: Array = found.astype(np.float64)
+    left = residual + columns @ step
+    return step, int(rank), float(left @ left)
 
 
 def pays(problem: Problem, fewer: Fitted, more: Fitted) -> tuple[float, bool]:
     """The misfit of the richer fit, and whether its branch is earned."""
     scale = misfit(problem, more)
     earned = gain(problem, fewer, more, scale) > EARNED
-    return scale, earned and held_out(problem, more) < PREDICTED * held_out(problem, fewer)
+    return scale, earned and left_out(problem, more).noise < PREDICTED * left_out(problem, fewer).noise
 
 
 def gain(problem: Problem, fewer: Fitted, more: Fitted, scale: float) -> float:
@@ -156,7 +171,7 @@ def counted(problem: Problem, points: Sequence[P], scale: float) -> list[Count[P
     """Fits with their criteria."""
     criteria = [aicc(problem, one, scale) for one in points]
     return [
-        Count(problem.count(one.x), one, value - min(criteria), held_out(problem, one))
+        Count(problem.count(one.x), one, value - min(criteria), left_out(problem, one))
         for one, value in zip(points, criteria, strict=True)
     ]
 

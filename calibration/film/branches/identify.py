@@ -252,9 +252,8 @@ class _Found:
         for k, one in enumerate(self.film.branches):
             units = np.eye(x.size)[[n + k, n + count + k]]
             ratio, log_time = (math.hypot(*self.budget(unit).values()) for unit in units)
-            found.append(
-                FoundBranch.judged(one.ratio, ratio, one.time, log_time, self.joint.window, self.tried[-1].held_out)
-            )
+            known = self.tried[-1].left_out.explained
+            found.append(FoundBranch.judged(one.ratio, ratio, one.time, log_time, self.joint.window, explained=known))
         return tuple(sorted(found, key=lambda one: one.time))
 
     def softening(self) -> tuple[Softening, ...]:
@@ -371,7 +370,7 @@ class _Found:
             branches=self.branches(),
             window=(low, high),
             instant=self.instant(*base.fixed_stretch, rest),
-            counts=tuple(BranchCount(one.branches, one.aicc, one.held_out) for one in self.tried),
+            counts=tuple(BranchCount(one.branches, one.aicc, one.left_out) for one in self.tried),
             slow=slow,
             hold=HOLD * slow,
             quick=quick,

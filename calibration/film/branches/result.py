@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.result import Quantity, finite, quantity_dict
+from calibration.film.result import SIGNIFICANT, Quantity, finite, quantity_dict
 
 Array = NDArray[np.float64]
 
 KNOWN_RATIO, KNOWN_TIME = 0.15, 0.3  # relative standard uncertainties up to which a branch is identified
-EXPLAINED = 1.5  # times its noise, up to which what was left out of the fit has to be predicted
+EXPLAINED = 1.5  # times what is expected, up to which a lack of fit is one that the stated uncertainties carry
 EDGE = 0.1  # of the logarithm of a time, from the end of the window
 HOLD = 1.2  # times a relaxation time, that a film is held to see it
 USUAL, FAR = 0.1, 0.5  # ratio of a branch that occurs; one that would not show below this ratio does not show
@@ -44,17 +44,17 @@ class FoundBranch:
         time: float,
         time_relative: float,
         window: tuple[float, float],
-        held_out: float,
+        *,
+        explained: bool,
     ) -> FoundBranch:
         """With its verdict and limits, from standard uncertainties and the times that the record can show (s).
 
-        ``held_out`` is that of the fit: where it does not predict what was left out, a further branch that the record
-        cannot tell apart may stand behind this one.
+        None is identified by a fit that does not predict what is left out (``explained``).
         """
         low, high = window
         if not math.log(low) + EDGE < math.log(time) < math.log(high) - EDGE:
             word = "outside the window"
-        elif held_out <= EXPLAINED and ratio_uncertainty <= KNOWN_RATIO * ratio and time_relative <= KNOWN_TIME:
+        elif explained and ratio_uncertainty <= KNOWN_RATIO * ratio and time_relative <= KNOWN_TIME:
             word = "identified"
         else:
             word = "bounded"
@@ -65,12 +65,60 @@ class FoundBranch:
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """How fits to the rest of the records predict parts that were left out.
+
+    What a fit says of a part differs from it by the noise of that part and by the uncertainty of the fit: far more than
+    noise where the rest hardly tells of it, as one of two rates of stretch does of the other. Against both together the
+    squares of a part of n numbers sum up to chi-square of n degrees of freedom. For a linear model the sum is by how
+    much chi-square of the fit falls when the part is left out (Chow 1960).
+
+    Attributes
+    ----------
+    noise : float
+        Root mean square of all the differences over the noise alone, by which models are compared.
+    expected : float
+        Of the part that is predicted worst: root mean square over what noise and uncertainty together give; near 1.
+    chance : float
+        Probability of as much by chance in any of the parts.
+    """
+
+    noise: float
+    expected: float
+    chance: float
+
+    @classmethod
+    def judged(cls, noise: float, parts: Sequence[tuple[int, float]]) -> LeftOut:
+        """From the degrees of freedom and the chi-square of every part; the worst one is the largest beyond chance."""
+        from scipy.special import chdtrc
+
+        found = []
+        for freedom, square in parts:
+            chance = min(1.0, len(parts) * float(chdtrc(freedom, square)))
+            found.append((math.sqrt(square / freedom), chance))
+        beyond = [one for one in found if one[1] < SIGNIFICANT]
+        worst = max(beyond) if beyond else min(found, key=lambda one: one[1])
+        return cls(noise, *worst)
+
+    @property
+    def explained(self) -> bool:
+        """Whether what is left out is as the fit says; a lack of fit below `EXPLAINED` is in what the fit states."""
+        return self.expected <= EXPLAINED or self.chance >= SIGNIFICANT
+
+
+@dataclass(frozen=True)
 class BranchCount:
-    """A number of branches: AICc over the least of all, and what was left out over its noise (near 1: predicted)."""
+    """A number of branches: AICc over the least of all, and how the fit predicts what is left out."""
 
     branches: int
     aicc: float
-    held_out: float
+    left_out: LeftOut
+
+    @property
+    def words(self) -> tuple[str, str, str, str]:
+        """A row of a table."""
+        left = self.left_out
+        return str(self.branches), f"{self.aicc:.1f}", f"{left.noise:.2f}", f"{left.expected:.2f}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,11 +208,11 @@ class Spectrum:
                 f"branch: ratio {one.ratio:.3g} +- {one.ratio_uncertainty:.1g}, time {one.time:.3g} s (95 %: {low:.3g} "
                 f"to {high:.3g} s): {one.verdict}"
             )
-        if self.branches and self.counts[-1].held_out > EXPLAINED:
+        if self.branches and not self.counts[-1].left_out.explained:
             words.append(
-                f"parts of the record that were left out are predicted to {self.counts[-1].held_out:.1f} times their "
-                "noise only: a further branch that this record cannot tell apart may stand behind those found, so that "
-                "none counts as identified; move faster, and hold longer"
+                f"a part of the record that was left out is predicted to {self.counts[-1].left_out.expected:.1f} times "
+                "what its noise and the uncertainty of the fit to the rest give: the film is not this law with these "
+                "branches, so that none counts as identified"
             )
         if not self.branches:
             words.append("no branch is needed to explain this record")

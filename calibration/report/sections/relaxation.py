@@ -21,8 +21,8 @@ def context(data: ReportData) -> Mapping[str, Any] | None:
         rows.append((f"{one.time:.3g}", f"{one.times[0]:.3g} to {one.times[1]:.3g}", ratio, error, one.verdict))
     branches = Table((">time / s", ">95 % limits / s", ">ratio", ">±", "verdict"), rows)
     counts = Table(
-        (">branches", ">AICc over the least", ">left out / noise"),
-        [(str(one.branches), f"{one.aicc:.1f}", f"{one.held_out:.2f}") for one in spectrum.counts],
+        (">branches", ">AICc over the least", ">left out / noise", ">worst part / expected"),
+        [one.words for one in spectrum.counts],
     )
     relaxed = data.identification.quantities["stiffness_fixed"]
     both = [

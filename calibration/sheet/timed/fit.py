@@ -134,11 +134,9 @@ class _Found:
         for k in range(ratio.size):
             units = np.eye(x.size)[[problem.numbers + k, problem.numbers + ratio.size + k]]
             errors = [math.hypot(*self.budget(unit).values()) for unit in units]
-            found.append(
-                FoundBranch.judged(
-                    float(ratio[k]), errors[0], float(time[k]), errors[1], problem.window, self.tried[-1].held_out
-                )
-            )
+            known = self.tried[-1].left_out.explained
+            numbers = float(ratio[k]), errors[0], float(time[k]), errors[1]
+            found.append(FoundBranch.judged(*numbers, problem.window, explained=known))
         return tuple(sorted(found, key=lambda one: one.time))
 
     def spectrum(self) -> Spectrum:
@@ -153,7 +151,7 @@ class _Found:
             branches=self.branches(),
             window=problem.window,
             instant=self.quantity((1.0 + float(ratio.sum())) * float(shear), at_once, "Pa"),
-            counts=tuple(BranchCount(one.branches, one.aicc, one.held_out) for one in self.tried),
+            counts=tuple(BranchCount(one.branches, one.aicc, one.left_out) for one in self.tried),
             slow=slow,
             hold=HOLD * slow,
             quick=quick,

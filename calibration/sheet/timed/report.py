@@ -127,11 +127,11 @@ def _tests(fit: TimedFit) -> dict[str, Any]:
 
 
 def _counts(fit: TimedFit) -> dict[str, Any]:
-    rows = [(str(one.branches), f"{one.aicc:.1f}", f"{one.held_out:.2f}") for one in fit.spectrum.counts]
+    rows = [one.words for one in fit.spectrum.counts]
     caption = "Each branch must lower AICc by 7 and predict what is left out no worse."
     return {
         "title": "How many branches",
-        "names": ("branches", "AICc over the least", "left out / noise"),
+        "names": ("branches", "AICc over the least", "left out / noise", "worst part / expected"),
         "rows": rows,
         "caption": caption,
     }

@@ -16,7 +16,7 @@ from calibration.film.branches.joint import Joint
 from calibration.film.branches.polygon import Stretches, through
 from calibration.film.branches.record import Record
 from calibration.film.branches.response import Motion, Relaxed
-from calibration.film.branches.result import BranchCount, FoundBranch, Spectrum
+from calibration.film.branches.result import BranchCount, FoundBranch, LeftOut, Spectrum
 from calibration.film.branches.spectrum import count_branches, covariance
 from calibration.film.curve import Curve
 from calibration.film.identify import identify
@@ -145,7 +145,9 @@ def test_an_elastic_fit_imports_nothing_of_branches() -> None:
 def test_sentences_come_from_the_facts() -> None:
     one = FoundBranch(0.1, 0.01, 30.0, 0.1, "identified", (0.08, 0.12), (25.0, 36.0))
     stiff = Quantity(2e5, 2e3, "Pa", {}, GOOD)
-    said = Spectrum((one,), (0.02, 600.0), stiff, (BranchCount(1, 0.0, 1.0),), 1000.0, 1200.0, 0.02).sentences
+    said = Spectrum(
+        (one,), (0.02, 600.0), stiff, (BranchCount(1, 0.0, LeftOut(1.0, 1.0, 1.0)),), 1000.0, 1200.0, 0.02
+    ).sentences
     assert "a branch of 1000 s would look like stiffness; hold 20 min to see it" in said
     assert (
         "no branch is needed to explain this record"
@@ -264,7 +266,7 @@ def test_a_film_that_is_slack_after_a_third_of_its_record_is_fitted_to_that_thir
     assert branch.verdict == "identified"
     assert abs(branch.ratio - 1.04) < 3.0 * branch.ratio_uncertainty < 0.05
     assert abs(math.log(branch.time / 10.3)) < 3.0 * branch.time_relative < 0.05
-    assert found.spectrum.counts[-1].held_out < 1.5
+    assert found.spectrum.counts[-1].left_out.explained
     assert "eps_r" not in found.quantities
     assert relaxed[1].flagged is not None and relaxed[1].flagged.all()
 
@@ -285,16 +287,16 @@ def test_where_a_film_hangs_slack_its_forces_are_left_out() -> None:
     assert abs(math.log(branch.time / 10.0)) < 3.0 * branch.time_relative
     stiff = found.quantities["stiffness_fixed"]
     assert abs(stiff.value - relaxed_stiffness(cone, found)) < 3.0 * stiff.uncertainty
-    assert found.spectrum.counts[-1].held_out < 2.0
+    assert found.spectrum.counts[-1].left_out.explained
     (curve,) = relaxed
     assert curve.flagged is not None and curve.flagged.any()
 
 
-@pytest.mark.parametrize(("held_out", "word"), [(1.02, "identified"), (2.08, "bounded")])
-def test_no_branch_counts_as_identified_where_left_out_parts_are_not_predicted(held_out: float, word: str) -> None:
-    """A branch of 0.93 at 0.61 s with one of 0.38 at 0.1 s, too quick to be told apart, was found as 1.06 +- 0.012."""
-    found = FoundBranch.judged(1.062, 0.0122, 0.564, 0.014, (0.02, 214.0), held_out)
-    assert found.verdict == word
+@pytest.mark.parametrize("explained", [True, False])
+def test_no_branch_counts_as_identified_where_left_out_parts_are_not_predicted(explained: bool) -> None:
+    found = FoundBranch.judged(1.062, 0.0122, 0.564, 0.014, (0.02, 214.0), explained=explained)
+    assert found.verdict == ("identified" if explained else "bounded")
+    left = LeftOut(2.08, 1.03 if explained else 2.0, 0.4 if explained else 1e-9)
     stiffness = Quantity(1e5, 1e3, "Pa", {}, GOOD)
-    spectrum = Spectrum((found,), (0.02, 214.0), stiffness, (BranchCount(1, 0.0, held_out),), 1000.0, 1200.0, 0.0)
-    assert any("none counts as identified" in one for one in spectrum.sentences) is (word == "bounded")
+    spectrum = Spectrum((found,), (0.02, 214.0), stiffness, (BranchCount(1, 0.0, left),), 1000.0, 1200.0, 0.0)
+    assert any("none counts as identified" in one for one in spectrum.sentences) is not explained

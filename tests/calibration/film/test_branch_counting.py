@@ -1,0 +1,79 @@
+"""What a fit to the rest says of a part of the records that was left out, for models that are linear."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.film.branches.counting import left_out
+from calibration.film.branches.result import LeftOut
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A problem and its fit: linear columns, and a zero with a prior as the last number."""
+
+    columns: Array
+    stretches: NDArray[np.intp]
+    data: Array
+
+    @property
+    def jacobian(self) -> Array:
+        zero = np.ones((self.data.size, 1))
+        columns = np.concatenate((self.columns, zero), axis=1)
+        return np.concatenate((columns, np.eye(1, columns.shape[1], columns.shape[1] - 1)))
+
+    @property
+    def x(self) -> Array:
+        return np.linalg.lstsq(self.jacobian, np.append(self.data, 0.0), rcond=None)[0]
+
+    @property
+    def residual(self) -> Array:
+        found: Array = np.append(self.columns @ self.x[:-1] + self.x[-1] - self.data, self.x[-1])
+        return found
+
+    @property
+    def cost(self) -> float:
+        return float(self.residual @ self.residual)
+
+    window = (0.1, 10.0)
+    independent = 100.0
+
+    def count(self, x: Array) -> int:
+        return 0
+
+    def bounds(self, x: Array) -> tuple[Array, Array]:
+        return np.full(x.size, -np.inf), np.full(x.size, np.inf)
+
+    def varied(self, x: Array) -> NDArray[np.bool_]:
+        return np.ones(x.size, dtype=np.bool_)
+
+
+STRETCHES = np.repeat(np.arange(4), 25)
+TIME = np.linspace(0.0, 1.0, 100)
+COLUMNS = np.stack((np.exp(-TIME), TIME**2, np.maximum(TIME - 0.7, 0.0)), axis=1)  # the last part alone tells of one
+
+
+def judged(seed: int, wrong: Array | float = 0.0) -> LeftOut:
+    noise = np.random.default_rng(seed).standard_normal(TIME.size)
+    made = Line(COLUMNS, STRETCHES, COLUMNS @ [300.0, 200.0, 500.0] + noise + wrong)
+    return left_out(made, made)
+
+
+def test_what_is_left_out_is_judged_by_noise_and_by_what_the_rest_can_tell() -> None:
+    """The right model misses parts by many times their noise, as the rest hardly tells of them, and is no worse."""
+    found = [judged(seed) for seed in range(60)]
+    assert np.mean([one.noise for one in found]) > 1.5
+    assert np.mean([one.expected for one in found]) < 1.3
+    assert sum(not one.explained for one in found) <= 1
+
+
+def test_a_part_that_goes_another_way_is_not_explained() -> None:
+    bent = np.where(STRETCHES == 1, 6.0 * np.sin(40.0 * TIME), 0.0)
+    for seed in range(20):
+        assert not judged(seed, bent).explained
+        assert judged(seed, bent).expected > 2.0
