@@ -16,7 +16,7 @@ from rig.base.clock import Clock
 from rig.base.errors import FaultError
 from rig.log import space
 from rig.log.errors import LogError
-from rig.log.schema import MONITORED
+from rig.log.schema import MONITORED, Way
 
 if TYPE_CHECKING:
     from rig.log.process import LogProcess
@@ -148,7 +148,7 @@ class Recorder:
                 self._write(f"/{sample.role}/sample", sample.t, **shown, flags=sample.flags.value)
         return sample
 
-    def wire(self, role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:
+    def wire(self, role: str, way: Way, data: bytes, t: float) -> None:
         """Write bytes as they were on the wire; ``t`` is the time that the driver was told.
 
         The time that the message is about is that of the loop's turn: what was read and sent in one turn has it in

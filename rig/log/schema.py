@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import Flag
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
@@ -47,13 +47,22 @@ def _flag_values(flags: type[Flag]) -> str:
     return ", ".join(f"{flag.value} {flag.name}" for flag in flags)
 
 
+Way = Literal["rx", "tx", "gone", "back"]
+WAYS: tuple[Way, ...] = get_args(Way)
+"""Read from an instrument, or sent to it; its link was lost, or works again (the last two have no data)."""
+
 _T = Field("t_s", "double", "clock time, seconds since the start of the run")
 _FLAGS = Field("flags", "fixed32", f"what is wrong with the sample, a sum of: {_flag_values(SampleFlag)}")
 _RAW = Channel(
     "RawBytes",
     (
         Field("t_s", "double", "clock time of the poll in which they passed, seconds since the start of the run"),
-        Field("data", "bytes", "as on the wire; a CAN frame is its identifier (2 bytes, big-endian) and its data"),
+        Field(
+            "data",
+            "bytes",
+            "as on the wire; a CAN frame is its identifier (2 bytes, big-endian) and its data. Empty where the "
+            "link was found gone, or to work again",
+        ),
     ),
 )
 
@@ -299,7 +308,7 @@ CHANNELS: dict[str, Channel] = {
         ),
     ),
     **{f"/{name}/sample": _MONITOR for name in MONITORS},
-    **{f"/raw/{role}/{way}": _RAW for role in ROLES for way in ("rx", "tx")},
+    **{f"/raw/{role}/{way}": _RAW for role in ROLES for way in WAYS},
 }
 
 _TYPES = {

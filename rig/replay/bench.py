@@ -19,7 +19,7 @@ from drivers.registry import instrument
 from drivers.settings import CanSettings
 from rig.replay.recording import Recording
 from rig.replay.served import Lag, ServedScript
-from rig.sim.wire import ByteWire, Frame, FrameWire
+from rig.sim.wire import ByteWire, Frame, FrameWire, WireGone
 
 
 class ReplayError(DeviceError):
@@ -99,17 +99,34 @@ class _Script:
             self._coming.append((t + later, data))
 
 
+class _Link:
+    """Says whether the link was gone, at a time and after so many requests."""
+
+    def __init__(self, script: _Script | ServedScript, changes: list[tuple[float, int, bool]]) -> None:
+        self._script = script
+        self._changes = changes
+
+    def check(self, t: float) -> None:
+        """Raises `WireGone` where it was."""
+        passed = [gone for when, requests, gone in self._changes if when <= t and requests <= self._script.requests]
+        if passed and passed[-1]:
+            raise WireGone
+
+
 class _ReplayByteWire(ByteWire):
     """A serial line with a log at its far end."""
 
-    def __init__(self, script: _Script | ServedScript) -> None:
+    def __init__(self, script: _Script | ServedScript, link: _Link) -> None:
         super().__init__()
         self._script = script
+        self._link = link
 
     def host_write(self, data: bytes, t: float) -> None:
         self._script.write(data, t)
+        self._link.check(t)
 
     def host_read(self, t: float) -> bytes:
+        self._link.check(t)
         return b"".join(self._script.read(t))
 
     @property
@@ -120,14 +137,17 @@ class _ReplayByteWire(ByteWire):
 class _ReplayFrameWire(FrameWire):
     """A CAN bus with a log at its far end."""
 
-    def __init__(self, script: _Script | ServedScript, bitrate: int) -> None:
+    def __init__(self, script: _Script | ServedScript, link: _Link, bitrate: int) -> None:
         super().__init__(bitrate=bitrate)
         self._script = script
+        self._link = link
 
     def host_write(self, frame: Frame, t: float) -> None:
         self._script.write(frame[0].to_bytes(2, "big") + bytes(frame[1]), t)
+        self._link.check(t)
 
     def host_read(self, t: float) -> list[Frame]:
+        self._link.check(t)
         return [(int.from_bytes(row[:2], "big"), row[2:]) for row in self._script.read(t)]
 
     @property
@@ -157,11 +177,16 @@ class ReplayBench:
         self.scripts: dict[str, _Script | ServedScript] = {}
         self._wires: dict[str, ByteWire | FrameWire] = {}
         passed: dict[str, list[Passed]] = {}
+        changes: dict[str, list[tuple[float, int, bool]]] = {}
         lag = Lag()
         for row in recording.rows:
             if row.topic.startswith("/raw/"):
                 _, _, role, way = row.topic.split("/")
-                passed.setdefault(role, []).append(Passed(row.t, way == "tx", row.fields["data"]))
+                rows = passed.setdefault(role, [])
+                if way in ("rx", "tx"):
+                    rows.append(Passed(row.t, way == "tx", row.fields["data"]))
+                else:
+                    changes.setdefault(role, []).append((row.t, sum(one.sent for one in rows), way == "gone"))
         for role, table in recording.experiment.scene.instruments.items():
             rows, depart = passed.get(role, []), partial(self._depart, role)
             script = (
@@ -170,10 +195,11 @@ class ReplayBench:
                 else _Script(rows, depart)
             )
             self.scripts[role] = script
+            link = _Link(script, [] if real_time else changes.get(role, []))
             if isinstance(table, CanSettings):
-                self._wires[role] = _ReplayFrameWire(script, table.bitrate)
+                self._wires[role] = _ReplayFrameWire(script, link, table.bitrate)
             else:
-                self._wires[role] = _ReplayByteWire(script)
+                self._wires[role] = _ReplayByteWire(script, link)
 
     def departure(self, role: str, t: float, made: bytes | None) -> Departure:
         """That ``made`` was sent at ``t`` where the log has something else."""

@@ -25,7 +25,7 @@ from rig.log.recorder import Recorder
 from rig.protocol.experiment import gains_of
 from rig.replay.recording import Recording, Row, counted_device, numbers
 from rig.scene.scene import Scene
-from rig.sim.wire import ByteWire, Frame, FrameWire
+from rig.sim.wire import ByteWire, Frame, FrameWire, WireGone
 
 if TYPE_CHECKING:
     from rig.log.writer import LogWriter
@@ -113,36 +113,52 @@ def verify(recording: Recording) -> Verification:
     return _Verifier(recording).run()
 
 
-class _FedByteWire(ByteWire):
-    """Gives what it is fed and keeps what is sent."""
+class _Fed:
+    """Gives what it is fed, keeps what is sent, and is gone when it was.
+
+    ``takes``: how many requests of the coming poll pass before the link is found gone; None where it is not.
+    """
+
+    gone: bool
 
     def __init__(self) -> None:
         super().__init__()
         self.arrived: list[bytes] = []
         self.sent: list[bytes] = []
+        self.takes: int | None = None
 
-    def host_read(self, t: float) -> bytes:
-        data, self.arrived = b"".join(self.arrived), []
+    def _read(self) -> list[bytes]:
+        if self.gone:
+            raise WireGone
+        data, self.arrived = self.arrived, []
         return data
 
-    def host_write(self, data: bytes, t: float) -> None:
+    def _keep(self, data: bytes) -> None:
         self.sent.append(data)
+        if self.takes is not None and len(self.sent) > self.takes:
+            self.gone, self.takes = True, None
+        if self.gone:
+            raise WireGone
 
 
-class _FedFrameWire(FrameWire):
+class _FedByteWire(_Fed, ByteWire):
+    """Bytes, as they were read and sent."""
+
+    def host_read(self, t: float) -> bytes:
+        return b"".join(self._read())
+
+    def host_write(self, data: bytes, t: float) -> None:
+        self._keep(data)
+
+
+class _FedFrameWire(_Fed, FrameWire):
     """The same for frames, each as the log has it."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.arrived: list[bytes] = []
-        self.sent: list[bytes] = []
-
     def host_read(self, t: float) -> list[Frame]:
-        rows, self.arrived = self.arrived, []
-        return [(int.from_bytes(row[:2], "big"), row[2:]) for row in rows]
+        return [(int.from_bytes(row[:2], "big"), row[2:]) for row in self._read()]
 
     def host_write(self, frame: Frame, t: float) -> None:
-        self.sent.append(frame[0].to_bytes(2, "big") + frame[1])
+        self._keep(frame[0].to_bytes(2, "big") + frame[1])
 
 
 class _Desk:
@@ -175,13 +191,16 @@ class _Rows:
 class _Stream:
     """What is known of one instrument while the log is gone through.
 
-    ``arrived`` and ``sent`` belong to the poll in the making, which was at ``t``. ``since`` is what arrived since the
-    last sample, from ``offset`` on; it begins anew with the next poll after a sample (``fresh``).
+    ``arrived``, ``sent``, ``back`` and ``gone`` (its link) belong to the poll in the making, which was at ``t``.
+    ``since`` is what arrived since the last sample, from ``offset`` on; it begins anew with the next poll after a
+    sample (``fresh``).
     """
 
     t: float = math.nan
     arrived: list[bytes] = field(default_factory=list)
     sent: list[bytes] = field(default_factory=list)
+    back: bool = False
+    gone: bool = False
     decoded: deque[bytes] = field(default_factory=deque)
     recorded: deque[Row] = field(default_factory=deque)
     since: bytearray = field(default_factory=bytearray)
@@ -258,19 +277,31 @@ class _Verifier:
     def _on_wire(self, role: str, way: str, t: float, data: bytes) -> None:
         """Everything read in a poll was read before anything was sent in it."""
         stream = self._streams[role]
-        if not stream.counted and (t != stream.t or (way == "rx" and stream.sent)):
+        if not stream.counted and (t != stream.t or (way in ("rx", "back") and stream.sent)):
             self._poll(role)
         stream.t = t
-        (stream.arrived if way == "rx" else stream.sent).append(data)
+        match way:
+            case "rx":
+                stream.arrived.append(data)
+            case "tx":
+                stream.sent.append(data)
+            case "back":
+                stream.back = True
+            case "gone":
+                stream.gone = True
 
     def _poll(self, role: str) -> None:
         """Let today's driver do what was done in the poll that has been gathered."""
         stream = self._streams[role]
-        if not (stream.arrived or stream.sent):
+        if not (stream.arrived or stream.sent or stream.back or stream.gone):
             return
         wire = self._desk.wires[role]
         self._arrive(stream)
         wire.arrived, stream.arrived = stream.arrived, []
+        wire.gone = wire.gone and not stream.back
+        if stream.gone:  # found so by the last request, or else by reading
+            wire.gone, wire.takes = not stream.sent, len(stream.sent) - 1 if stream.sent else None
+        stream.back = stream.gone = False
         device = self._bench.devices[role]
         if isinstance(device, Renewed):  # the guard called it all the time
             device.renew()
@@ -279,8 +310,8 @@ class _Verifier:
                 samples = device.poll(stream.t)
                 break
             except DeviceError as error:
-                # In the run it was raised by a poll that left no trace in the log, and then it was polled on.
-                if str(error) == stream.error:
+                # The recorded poll ended with it, unless more was asked: then a poll that left no trace had raised it.
+                if wire.sent == stream.sent or str(error) == stream.error:
                     samples = []
                     break
                 stream.error = str(error)

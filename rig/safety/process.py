@@ -25,7 +25,6 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import click
 
@@ -39,7 +38,7 @@ from rig.bench.devices import ROLE, Link, make_supply
 from rig.log.errors import LogError
 from rig.log.recorder import Severity
 from rig.log.remote import RemoteLog
-from rig.log.schema import MONITORED, SETTINGS
+from rig.log.schema import MONITORED, SETTINGS, Way
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import ADVICE, GIVE_BACK, NOT_SAFE, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
@@ -398,7 +397,7 @@ class Server:
             }
         )
 
-    def _tell_wire(self, role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:
+    def _tell_wire(self, role: str, way: Way, data: bytes, t: float) -> None:
         if not self._record(f"/raw/{role}/{way}", t, data=data):
             self._channel.send({"is": "wire", "way": way, "data": data.hex(), "t": t})
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 from drivers.links.link import DeviceLost
 from drivers.roles import Device, MonitorSample
 from rig.bench.devices import Link, make_device
+from rig.log.schema import Way
 from rig.scene.scene import Scene
 
 NOTHING: Sequence[MonitorSample] = ()
 
 
-def _untold(role: str, way: Literal["rx", "tx"], data: bytes, t: float) -> None:
+def _untold(role: str, way: Way, data: bytes, t: float) -> None:
     """The log has these readings, not their bytes: those would follow on those of another driver's dialogue."""
 
 
