@@ -37,6 +37,7 @@ TURN_S = 2.0  # what a question costs: the film is held where it is meanwhile
 LITTLE = 0.05  # weight of what is known well enough already
 CONFIRM_S = 8.0  # of new data before a claim is believed
 HOPELESS = 3  # fits in a row that say that it cannot be reached
+MET_WORDS = "known well enough, and so said the fit before"
 FIRST_STRETCH = 1.25  # times the pre-stretch: where the stiffness is wanted before there is a fit
 
 
@@ -56,8 +57,8 @@ class Learner:
     wanted: Sequence[Wanted]
     settle_s: float = 1.0
     speed: float = 5e-3
-    _met: int = 0
-    _hopeless: int = 0
+    _met: dict[str, int] = field(default_factory=dict)  # fits in a row that say so, by name
+    _hopeless: dict[str, int] = field(default_factory=dict)
     _specimen: Specimen = field(init=False)
 
     def __post_init__(self) -> None:
@@ -69,36 +70,60 @@ class Learner:
     def advise(self, curves: Sequence[Curve], found: Identification | None, question: Ask) -> Advice:
         """What to do, by the curves recorded and the fit of them; None while there is none."""
         stands = {} if found is None else self.standing(curves, found)
-        if found is None or any(one.name not in found.quantities for one in self.wanted):
-            return self._next(curves, found, question, {}, "first places: there is no fit yet")
-        worst = max(self.wanted, key=lambda one: stands[one.name][0] / one.relative)
-        known = tuple(_standing(one, found.quantities[one.name], stands[one.name][0]) for one in self.wanted)
-        told = _about(known[self.wanted.index(worst)], known)
-        missing = [one for one in self.wanted if stands[one.name][0] > one.relative]
-        lost = [one for one in missing if stands[one.name][1] > one.relative]
-        self._hopeless = self._hopeless + 1 if lost else 0
-        self._met = 0 if missing else self._met + 1
-        if self._hopeless >= HOPELESS:
-            worst = lost[0]
-            part, size = _largest(found.quantities[worst.name], worst)
-            reason = f"{worst} cannot be reached by more time: {part} alone leaves {100 * size:.3g} %"
-            told = _about(known[self.wanted.index(worst)], known)
-            return replace(told, kind=Kind.UNREACHABLE, reason=reason)
-        if self._met > 1:
-            return replace(told, kind=Kind.MET, reason="known well enough, and so said the fit before")
+        known = () if found is None else self._known(stands, found, question.spent_s)
+        if len(known) < len(self.wanted):
+            return replace(self._next(curves, found, question, {}, "first places: there is no fit yet"), known=known)
+        open_ = [one for one in known if one.outcome is Kind.TIME]
+        lost = [one for one in known if one.outcome is Kind.UNREACHABLE]
+        told = _about(max(open_ or lost or known, key=lambda one: one.relative / one.wanted), known)
+        if not open_:
+            kind, words = (Kind.UNREACHABLE, lost[0].reason) if lost else (Kind.MET, MET_WORDS)
+            return replace(told, kind=kind, reason=words)
         if question.left_s <= TURN_S:
             return replace(told, kind=Kind.TIME, reason="the time is out")
-        weights = {one.name: 1.0 if one in missing else LITTLE for one in self.wanted}
+        missing = [one.quantity for one in open_ if one.relative > one.wanted]
+        weights = {one.quantity: 1.0 if one.quantity in missing else LITTLE for one in known}
         reason = "tells most per second" if missing else "known well enough; confirmed by new data"
         next_one = self._next(curves, found, question, weights, reason)
+        wishes = {one.name: one for one in self.wanted}
         return replace(
             told,
             reason=reason,
             h=next_one.h,
             voltage=next_one.voltage,
             hold_s=next_one.hold_s if missing else CONFIRM_S,
-            expected_s=max((_time_left(stands[one.name], one, question.spent_s) for one in missing), default=0.0),
+            expected_s=max((_time_left(stands[name], wishes[name], question.spent_s) for name in missing), default=0.0),
         )
+
+    def _known(
+        self, stands: Mapping[str, tuple[float, float]], found: Identification, spent: float
+    ) -> tuple[Standing, ...]:
+        """Each wish that the fit knows, with its own outcome."""
+        known = []
+        for wish in self.wanted:
+            if wish.name not in stands:
+                self._met[wish.name] = self._hopeless[wish.name] = 0
+                continue
+            relative, stays = stands[wish.name]
+            self._met[wish.name] = self._met.get(wish.name, 0) + 1 if relative <= wish.relative else 0
+            self._hopeless[wish.name] = self._hopeless.get(wish.name, 0) + 1 if stays > wish.relative else 0
+            quantity = found.quantities[wish.name]
+            outcome, reason = self._outcome(wish, quantity, stands[wish.name], spent)
+            error = relative * abs(quantity.value)
+            known.append(Standing(wish.name, quantity.value, error, relative, wish.relative, outcome, reason))
+        return tuple(known)
+
+    def _outcome(self, wish: Wanted, quantity: Quantity, stands: tuple[float, float], spent: float) -> tuple[Kind, str]:
+        """Met, unreachable or more time; and why."""
+        if self._hopeless[wish.name] >= HOPELESS:
+            part, size = _largest(quantity, wish)
+            return Kind.UNREACHABLE, f"{wish} cannot be reached by more time: {part} alone leaves {100 * size:.3g} %"
+        if self._met[wish.name] > 1:
+            return Kind.MET, MET_WORDS
+        if self._met[wish.name]:
+            return Kind.TIME, "well enough by one fit; another one has to confirm it"
+        left = _time_left(stands, wish, spent)
+        return Kind.TIME, f"about {left:.0f} s more" if math.isfinite(left) else "more time"
 
     def standing(self, curves: Sequence[Curve], fit: Identification) -> dict[str, tuple[float, float]]:
         """By name of what is wanted: relative standard uncertainty, and what of it no time makes smaller."""
@@ -174,13 +199,10 @@ def believed_film(specimen: Specimen, terms: int) -> Specimen:
     return specimen.with_material(one_term(specimen.material, (1.1 * lp, 1.4 * lp), lp))
 
 
-def _standing(wanted: Wanted, quantity: Quantity, relative: float) -> Standing:
-    return Standing(wanted.name, quantity.value, relative * abs(quantity.value), relative, wanted.relative)
-
-
 def _about(one: Standing, known: tuple[Standing, ...]) -> Advice:
     """An advice that says how well a quantity is known, and the others, and so far nothing else."""
-    return Advice(Kind.GO, "", **one.__dict__, known=known)
+    told = {name: getattr(one, name) for name in ("quantity", "value", "standard_uncertainty", "relative", "wanted")}
+    return Advice(Kind.GO, "", **told, known=known)
 
 
 def _largest(quantity: Quantity, wanted: Wanted) -> tuple[str, float]:

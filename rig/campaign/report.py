@@ -49,12 +49,21 @@ def rows_of(campaign: Campaign) -> list[Row]:
         results: dict[str, tuple[float, float, str]] = {}
         found = ""
         if complete:
-            for message in read_log(campaign.logs / complete[-1].log).messages("/result"):
-                fields = message.fields
+            messages = [one.fields for one in read_log(campaign.logs / complete[-1].log).messages("/result")]
+            for fields in messages:
                 results[fields["name"]] = (fields["value"], fields["standard_uncertainty"], fields["unit"])
-                found = fields["outcome"]
+            found = _found(messages)
         rows.append(Row(one, results, found))
     return rows
+
+
+def _found(messages: list[dict[str, Any]]) -> str:
+    """How the last step that found something ended; for each of its results where they ended differently."""
+    last = [fields for fields in messages if fields["step"] == messages[-1]["step"]]
+    outcomes = {fields["outcome"] for fields in last}
+    if len(outcomes) < 2:
+        return "".join(outcomes)
+    return ", ".join(f"{fields['name']} {fields['outcome']}" for fields in last)
 
 
 def statistics(rows: list[Row], campaign: Campaign) -> list[Statistics]:

@@ -203,6 +203,8 @@ CHANNELS: dict[str, Channel] = {
             Field("unit", "string", "unit of value and uncertainty"),
             Field("relative_uncertainty", "double", "the uncertainty over the value"),
             Field("wanted_uncertainty", "double", "relative standard uncertainty that is wanted"),
+            Field("outcome", "string", "its own: met by two fits in a row; unreachable; time: it needs more time"),
+            Field("reason", "string", "of the outcome, in words"),
         ),
     ),
     "/cycle": Channel(

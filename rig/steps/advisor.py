@@ -14,8 +14,8 @@ class Kind(StrEnum):
 
     GO = "go"  # measure at this place
     MET = "met"  # all that was wanted is reached
-    UNREACHABLE = "unreachable"  # what no time makes smaller is more than was wanted
-    TIME = "time"  # the time is out
+    UNREACHABLE = "unreachable"  # what no time makes smaller is more than was wanted; the rest is reached
+    TIME = "time"  # the time is out; of one quantity: it needs more time
     FAILED = "failed"  # no advice: the fit failed, or its process ended or took too long
 
 
@@ -47,7 +47,9 @@ class Ask:
 class Standing:
     """How well one of the quantities that are wanted is known, SI units, by the parts of the uncertainty that count.
 
-    ``relative`` is its standard uncertainty over its value, ``wanted`` what of that is wanted.
+    ``relative`` is its standard uncertainty over its value, ``wanted`` what of that is wanted. ``outcome`` is its own,
+    whatever the others are: `Kind.MET`, `Kind.UNREACHABLE`, or `Kind.TIME` while it needs more time; ``reason`` is for
+    people.
     """
 
     quantity: str
@@ -55,20 +57,19 @@ class Standing:
     standard_uncertainty: float
     relative: float
     wanted: float
-
-    @property
-    def met(self) -> bool:
-        """Whether it is known as well as wanted."""
-        return self.relative <= self.wanted
+    outcome: Kind
+    reason: str
 
     def as_fields(self) -> dict[str, str | float]:
         """As ``/standing`` of the log has it."""
-        return {there: getattr(self, here) for here, there in _KNOWN.items()} | {"unit": unit_of(self.quantity)}
+        told = {there: getattr(self, here) for here, there in _KNOWN.items()}
+        return told | {"outcome": str(self.outcome), "reason": self.reason, "unit": unit_of(self.quantity)}
 
     @classmethod
     def from_fields(cls, fields: Mapping[str, Any]) -> Standing:
         """What a row of ``/standing`` says."""
-        return cls(**{here: fields[there] for here, there in _KNOWN.items()})
+        told = {here: fields[there] for here, there in _KNOWN.items()}
+        return cls(**told, outcome=Kind(fields["outcome"]), reason=fields["reason"])
 
 
 def unit_of(quantity: str) -> str:
@@ -96,7 +97,7 @@ class Advice:
     expected_s : float
         Seconds that it will still take as far as can be told; NaN where it cannot.
     known : tuple of Standing
-        All quantities that are wanted, in the order of the wish; empty before there is a fit of them all.
+        Those of the quantities that are wanted that a fit knows, in the order of the wish; empty before there is a fit.
     """
 
     kind: Kind

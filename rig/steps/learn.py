@@ -28,6 +28,7 @@ from rig.steps.wanted import EXAMPLE, Wanted, parse_wanted
 LEAST_TIME_S = 60.0
 ANSWER_S = 60.0  # a fit that takes longer is given up
 FAILURES = 3  # fits in a row that fail: then the step ends, in order
+ENDS = {Kind.MET: "met", Kind.UNREACHABLE: "unreachable", Kind.TIME: "needs more time"}  # of one wish, for people
 HOLD_ANYWAY_S = 10.0  # where the film is, after a fit that failed
 
 
@@ -189,7 +190,7 @@ class _Loop:
                 yield from self._hold(min(HOLD_ANYWAY_S, self.left))
             else:
                 break
-        self._result(advice)
+        self._result()
         yield from self._voltage(0.0)
         yield from self._move(self._action.h[0])
 
@@ -229,13 +230,19 @@ class _Loop:
         if advice.kind is Kind.FAILED:
             rig.recorder.event("warning", "fit", advice.reason)
 
-    def _result(self, advice: Advice) -> None:
-        """All that was wanted, by the newest fit, in the order of the wish."""
+    def _result(self) -> None:
+        """All that was wanted, by the newest fit, in the order of the wish; NaN for what no fit has known yet."""
         action, recorder = self._action, self._rig.recorder
-        for one in self._known:
-            outcome, unit = str(Kind.MET if one.met else advice.kind), unit_of(one.quantity)
-            error = one.standard_uncertainty
-            recorder.result(action.step, action.kind, outcome, one.quantity, one.value, error, unit)
+        known = {one.quantity: one for one in self._known}
+        for wish in action.by.wanted:
+            one = known.get(wish.name)
+            outcome, value, error = (
+                (Kind.TIME, math.nan, math.nan) if one is None else (one.outcome, one.value, one.standard_uncertainty)
+            )
+            recorder.result(action.step, action.kind, str(outcome), wish.name, value, error, unit_of(wish.name))
+            if len(action.by.wanted) > 1:
+                said = f"{ENDS[outcome]} ({100 * one.relative:.3g} %; {one.reason})" if one else "not known yet"
+                self._rig.control.say(f"  {wish}: {said}.")
 
     def _go(self, advice: Advice) -> Turns:
         """At the lower of the two voltages: that the film bears."""

@@ -67,6 +67,8 @@ SAMPLES: dict[str, dict[str, Any]] = {
         "unit": "Pa",
         "relative_uncertainty": 0.0075,
         "wanted_uncertainty": 0.01,
+        "outcome": "met",
+        "reason": "known well enough by two fits in a row",
     },
     "/result": {
         "step": 4,

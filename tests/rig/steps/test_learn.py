@@ -49,7 +49,7 @@ threshold_mN = 8.0
 max_travel_mm = 8.0
 [[step]]
 do = "learn"
-until = "eps_r 1 %"
+until = "stiffness 0.8 %, eps_r 1 %"
 at_most_min = 1
 settle_s = 0.2
 [[step]]
@@ -79,7 +79,10 @@ class Scripted:
 
 def go(h: float, voltage: float, hold_s: float = 1.0, relative: float = 0.02) -> Advice:
     told = {"quantity": "eps_r", "value": 1.7, "standard_uncertainty": 1.7 * relative, "relative": relative}
-    known = (Standing("stiffness", 1.2e5, 1.2e3, 0.01, 0.008), Standing(**told, wanted=0.01))
+    known = (
+        Standing("stiffness", 1.2e5, 1.2e3, 0.01, 0.008, Kind.UNREACHABLE, "thickness alone leaves 0.9 %"),
+        Standing(**told, wanted=0.01, outcome=Kind.TIME, reason="well enough by one fit"),
+    )
     return Advice(Kind.GO, "tells most per second", h, voltage, hold_s, wanted=0.01, **told, known=known)
 
 
@@ -193,7 +196,7 @@ def test_it_goes_where_it_is_told_says_why_and_ends_at_0_V(
     assert np.nanmax(measured.voltage[1:][moved & (measured.h[1:] > 1e-3)]) < 1.02 * low + 20.0
     results = [message.fields for message in log.messages("/result")]  # all that was wanted, not only the last to come
     told = [(one["name"], one["outcome"], one["value"], one["unit"]) for one in results]
-    assert told == [("stiffness", "time", 1.2e5, "Pa"), ("eps_r", "met", 1.7, "1")]
+    assert told == [("stiffness", "unreachable", 1.2e5, "Pa"), ("eps_r", "time", 1.7, "1")]
     assert [one["standard_uncertainty"] for one in results] == pytest.approx([1.2e3, 1.7 * 0.009])
     standings = [message.fields for message in log.messages("/standing")]
     assert [(one["number"], one["quantity"]) for one in standings][-2:] == [(4, "stiffness"), (4, "eps_r")]
@@ -212,6 +215,9 @@ def test_fits_that_keep_failing_end_the_step_in_order(experiment: Experiment, tm
     log = read_log(out)
     assert (log.outcome or {})["status"] == "complete"
     assert sum("the process has ended" in words for words in said) == FAILURES
+    results = [message.fields for message in log.messages("/result")]  # nothing is known, and it says so
+    assert [(one["name"], one["outcome"]) for one in results] == [("stiffness", "time"), ("eps_r", "time")]
+    assert np.isnan([one["value"] for one in results]).all() and "eps_r 1 %: not known yet." in " ".join(said)
     assert np.nanmax(np.abs(log.columns("/hv/sample")["voltage_V"])) < 60.0
 
 
@@ -272,7 +278,10 @@ def test_each_step_is_served_by_what_it_wants(monkeypatch: pytest.MonkeyPatch, t
         process.ask(Ask(4, 1, 0.0, 0.0, 1.0, 50.0), 0.0)
         process._waiting = False
         process.ask(Ask(5, 1, 0.0, 0.0, 1.0, 50.0), 1.0)
-    assert [line["step"]["until"] for line in told if "scene" in line] == ["eps_r 1 %", "stiffness 2 %"]
+    assert [line["step"]["until"] for line in told if "scene" in line] == [
+        "stiffness 0.8 %, eps_r 1 %",
+        "stiffness 2 %",
+    ]
 
 
 @pytest.mark.slow

@@ -1,0 +1,94 @@
+"""What is said of each quantity that a closed loop is to find: its own outcome, whatever the others are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from calibration.film.identify import Identification
+from rig.analysis.learning import HOPELESS, Learner
+from rig.scene.scene import load_scene
+from rig.steps.advisor import Advice, Ask, Kind
+from rig.steps.wanted import parse_wanted
+
+SCENE = Path(__file__).resolve().parents[3] / "sim_fixtures" / "scenes" / "cone-4mm.toml"
+WISH = "stiffness 1 %, eps_r 1 %"
+MET, TIME, LOST = Kind.MET, Kind.TIME, Kind.UNREACHABLE
+GOOD, POOR, STUCK = (0.009, 0.001), (0.03, 0.001), (0.03, 0.02)  # relative uncertainty, and what of it stays
+
+Stands = Mapping[str, tuple[float, float]]
+
+
+class Told(Learner):
+    """Its fits stand as they are told to; where it goes next is not asked."""
+
+    def standing(self, curves: object, fit: object) -> dict[str, tuple[float, float]]:
+        return dict(cast("Any", fit).stands)
+
+    def _next(self, *args: Any, **options: Any) -> Advice:
+        self.weights = args[3]
+        return Advice(Kind.GO, args[4], 3e-3, 0.0, 8.0)
+
+
+def answers(fits: Sequence[Stands], left_s: float = 600.0) -> tuple[list[Advice], Told]:
+    scene, _ = load_scene(SCENE)
+    learner = Told(scene, parse_wanted(WISH))
+    found = []
+    for number, stands in enumerate(fits, 1):
+        budget = {name: {"noise": one[0], "thickness": one[1]} for name, one in stands.items()}
+        quantities = {name: SimpleNamespace(value=1.0, budget=budget[name]) for name in stands}
+        fit = cast("Identification", SimpleNamespace(stands=stands, quantities=quantities))
+        found.append(learner.advise([], fit, Ask(4, number, 0.0, 0.0, 60.0, left_s)))
+    return found, learner
+
+
+def both(stiffness: tuple[float, float], eps_r: tuple[float, float]) -> Stands:
+    return {"stiffness": stiffness, "eps_r": eps_r}
+
+
+@pytest.mark.parametrize(
+    ("fits", "kind", "outcomes"),
+    [
+        ([both(GOOD, GOOD)], Kind.GO, (TIME, TIME)),  # one fit says so: another one has to confirm it
+        ([both(GOOD, GOOD)] * 2, MET, (MET, MET)),
+        ([both(GOOD, POOR), both(POOR, GOOD), both(GOOD, GOOD)], Kind.GO, (TIME, MET)),
+        ([both(STUCK, POOR)] * (HOPELESS - 1), Kind.GO, (TIME, TIME)),
+        ([both(STUCK, POOR)] * HOPELESS, Kind.GO, (LOST, TIME)),  # the other one only needs more time, and gets it
+        ([both(STUCK, POOR)] * HOPELESS + [both(STUCK, GOOD)] * 2, LOST, (LOST, MET)),
+        ([both(GOOD, STUCK)] * HOPELESS, LOST, (MET, LOST)),
+        ([both(STUCK, STUCK)] * HOPELESS, LOST, (LOST, LOST)),
+        ([both(STUCK, GOOD), both(STUCK, GOOD), both(POOR, GOOD), both(STUCK, GOOD)], Kind.GO, (TIME, MET)),
+        ([both(STUCK, POOR)] * HOPELESS + [both(GOOD, GOOD)] * 2, MET, (MET, MET)),  # later fits say that it can be
+    ],
+)
+def test_each_quantity_has_its_own_outcome(fits: Sequence[Stands], kind: Kind, outcomes: tuple[Kind, Kind]) -> None:
+    *_, last = answers(fits)[0]
+    assert last.kind is kind
+    assert tuple(one.outcome for one in last.known) == outcomes
+    for one in last.known:
+        assert ("thickness alone leaves 2 %" in one.reason) is (one.outcome is LOST)
+        assert one.outcome is not MET or one.relative <= one.wanted
+    if kind is LOST:
+        assert "cannot be reached" in last.reason
+
+
+def test_what_cannot_be_reached_is_not_what_the_next_place_is_chosen_for() -> None:
+    (*_, last), learner = answers([both(STUCK, POOR)] * HOPELESS)
+    assert last.quantity == "eps_r" and learner.weights["eps_r"] > 10.0 * learner.weights["stiffness"]
+
+
+def test_the_time_is_out_for_what_needed_more_and_only_for_that() -> None:
+    fits = [both(STUCK, POOR)] * HOPELESS
+    *_, last = answers(fits, left_s=1.0)[0]
+    assert last.kind is TIME and [one.outcome for one in last.known] == [LOST, TIME]
+    assert "more" in last.known[1].reason
+
+
+def test_a_quantity_that_the_fit_does_not_know_yet_takes_nothing_from_the_other() -> None:
+    (first, second), _ = answers([{"stiffness": GOOD}] * 2)
+    assert first.kind is second.kind is Kind.GO
+    assert [(one.quantity, one.outcome) for one in second.known] == [("stiffness", MET)]
