@@ -26,6 +26,11 @@ PER_DECADE = 4  # relaxation times that a search tries
 GROUPS = 8  # parts of the records that are left out in turn
 ALMOST_SURE = 1.6449  # standard deviations that 95 of 100 stay below
 DECADES_BEYOND = 1.3  # of the window, for branches that are not seen
+SEARCHED = 1.0 / 3.0, 10.0  # of the ends of the window: a time is not held at an end that it lies beyond
+APART = 0.5  # decades: a branch nearer to another one is one with it
+OCCURS = 0.02, 2.0  # ratios of branches
+MOST_LIKELY = 50.0  # logarithm of a likelihood over that without: what is more is as sure
+RATIOS = 25  # of them, evenly in the logarithm, that an average is taken of
 
 
 class Fitted(Protocol):
@@ -93,6 +98,15 @@ def free_columns(problem: Problem, point: Fitted) -> NDArray[np.bool_]:
     inside = np.minimum(point.x - low, high - point.x) > 1e-6 * span
     found: NDArray[np.bool_] = problem.varied(point.x) & inside
     return found
+
+
+def unknown_columns(problem: Problem, point: Fitted) -> NDArray[np.bool_]:
+    """Entries of x that are uncertain: what is free, and times at an end of the search, which is no knowledge."""
+    free, count = free_columns(problem, point), problem.count(point.x)
+    errors = point.residual.size - problem.stretches.size
+    last = point.x.size - errors
+    free[last - count : last] |= point.x[last - 2 * count : last - count] > 0.0
+    return free
 
 
 def numbers(problem: Problem, point: Fitted) -> int:
@@ -181,6 +195,53 @@ def grid(problem: Problem, beyond: float) -> Array:
     shortest, longest = problem.window
     longest *= 10.0**beyond
     return np.geomspace(shortest, longest, max(2, round(PER_DECADE * math.log10(longest / shortest)) + 1))
+
+
+def searched(window: tuple[float, float]) -> tuple[float, float]:
+    """Logarithms of the shortest and the longest relaxation time (s) that a fit may come to."""
+    short, long = (math.log(end * factor) for end, factor in zip(window, SEARCHED, strict=True))
+    return short, long
+
+
+def further_times(problem: Problem, found: Array, last: float) -> Array:
+    """Relaxation times (s), up to the ``last``, of branches that may stand unseen beside those that were ``found``."""
+    near = np.concatenate((found * 10.0**-APART, found * 10.0**APART))
+    times = np.union1d(grid(problem, DECADES_BEYOND), near[near >= problem.window[0]])
+    away = np.abs(np.log10(times[:, None] / found)).min(axis=1, initial=math.inf)
+    chosen: Array = times[(away > APART - 1e-9) & (times <= last)]
+    return chosen
+
+
+def hidden(point: Fitted, free: NDArray[np.bool_], rows: Array, scale: float) -> Array:
+    """What further branches add to the residuals that may be there unseen, each with a ratio that is to be expected.
+
+    ``rows`` are what they add with a ratio of one (branches, residuals). The ratio is the root mean square over those
+    that occur, weighted by how well they go with the data beside what is ``free``, where it is as probable before as
+    not that there is one.
+    """
+    u, s, _ = np.linalg.svd(point.jacobian[:, free], full_matrices=False)
+    base = u[:, s > 1e-10 * s[0]]
+    ratios = np.geomspace(*OCCURS, RATIOS)
+    found = np.zeros_like(rows)
+    for one, row in zip(found, rows, strict=True):
+        visible = row - base @ (base.T @ row)
+        along, square = float(visible @ point.residual) / scale, float(visible @ visible) / scale
+        gain = -2.0 * along * ratios - square * ratios**2  # by which chi-square falls
+        likely = np.exp(np.minimum(0.5 * gain, MOST_LIKELY))
+        one[:] = math.sqrt(float((likely * ratios**2).sum()) / (RATIOS + float(likely.sum()))) * row
+    return found
+
+
+def shifted(response: Array, times: Array, rows: Array) -> tuple[float, float]:
+    """The largest shift of a number by one of the branches that are `hidden`, and the relaxation time (s) of that one.
+
+    ``response`` is what a change of the residuals does to the number.
+    """
+    if not times.size:
+        return 0.0, 0.0
+    sizes = np.abs(rows @ response)
+    worst = int(np.argmax(sizes))
+    return float(sizes[worst]), float(times[worst])
 
 
 def shows_from(point: Fitted, free: NDArray[np.bool_], rows: Array, scale: float) -> list[float]:

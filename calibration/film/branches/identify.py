@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.counting import Count, misfit
+from calibration.film.branches.counting import Count, misfit, shifted
 from calibration.film.branches.joint import SOFTENING, Joint, Point
 from calibration.film.branches.record import Record, thinned
 from calibration.film.branches.result import (
@@ -23,12 +23,13 @@ from calibration.film.branches.result import (
     USUAL,
     BranchCount,
     FoundBranch,
+    Known,
     Softening,
     Spectrum,
     Trace,
     blind_times,
 )
-from calibration.film.branches.spectrum import Unseen, count_branches, covariance, unseen
+from calibration.film.branches.spectrum import Unseen, beside, count_branches, covariance, unseen
 from calibration.film.curve import Curve
 from calibration.film.differences import DIMENSIONS
 from calibration.film.identify import identify
@@ -245,15 +246,20 @@ class _Found:
             found["eps_r"] = self.quantity(film.eps_r, slopes["eps_r"], "1", base.quantities["eps_r"])
         return found, slopes
 
-    def branches(self) -> tuple[FoundBranch, ...]:
-        """Each with its verdict, the quickest first."""
-        x, n, count = self.point.x, len(self.joint.coordinates.names), len(self.film.branches)
+    def known(self, k: int, value: float, hidden: tuple[Array, Array]) -> Known:
+        """The k-th entry of x, with what branches that may hide make of it."""
+        unit = np.eye(self.point.x.size)[k]
+        return Known(value, math.hypot(*self.budget(unit).values()), *shifted(unit @ self.response, *hidden))
+
+    def branches(self, last: float) -> tuple[FoundBranch, ...]:
+        """Each with its verdict, the quickest first; what takes longer than ``last`` (s) counts as stiffness."""
+        n, count = len(self.joint.coordinates.names), len(self.film.branches)
+        hidden = beside(self.joint, self.point, self.scale, last)
         found = []
         for k, one in enumerate(self.film.branches):
-            units = np.eye(x.size)[[n + k, n + count + k]]
-            ratio, log_time = (math.hypot(*self.budget(unit).values()) for unit in units)
-            known = self.tried[-1].left_out.explained
-            found.append(FoundBranch.judged(one.ratio, ratio, one.time, log_time, self.joint.window, explained=known))
+            both = self.known(n + k, one.ratio, hidden), self.known(n + count + k, math.log(one.time), hidden)
+            explained = self.tried[-1].left_out.explained
+            found.append(FoundBranch.judged(*both, self.joint.window, explained=explained))
         return tuple(sorted(found, key=lambda one: one.time))
 
     def softening(self) -> tuple[Softening, ...]:
@@ -367,7 +373,7 @@ class _Found:
         slow, quick = blind_times(((one.time, one.shows_from) for one in alone), high)
         rest = float(np.mean([record.errors.specimen.prestretch for record in self.joint.records]))
         return Spectrum(
-            branches=self.branches(),
+            branches=self.branches(slow),
             window=(low, high),
             instant=self.instant(*base.fixed_stretch, rest),
             counts=tuple(BranchCount(one.branches, one.aicc, one.left_out) for one in self.tried),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from calibration.film.branches.counting import searched
 from calibration.film.branches.polygon import correlation
 from calibration.film.branches.record import Bins, Record
 from calibration.film.branches.response import Around, Relaxed, Response, Slopes, with_branches
@@ -204,7 +205,7 @@ class Joint:
         """Of a vector."""
         low, high = self.coordinates.bounds(x)
         k, errors = self.count(x), len(self.nuisances)
-        shortest, longest = (math.log(one) for one in self.window)
+        shortest, longest = searched(self.window)
         low = np.concatenate((low, np.zeros(k), np.full(k, shortest), np.full(errors, -np.inf)))
         return low, np.concatenate((high, np.full(k, MOST_RATIO), np.full(k, longest), np.full(errors, np.inf)))
 

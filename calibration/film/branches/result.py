@@ -22,9 +22,30 @@ USUAL, FAR = 0.1, 0.5  # ratio of a branch that occurs; one that would not show 
 
 
 @dataclass(frozen=True)
+class Known:
+    """A number of a branch: standard uncertainty if there is no further branch, and the shift by one that hides.
+
+    The hidden one is that which shifts it most, of the relaxation time ``near`` (s); 0 where there is none.
+    """
+
+    value: float
+    alone: float
+    shift: float = 0.0
+    near: float = 0.0
+
+    @property
+    def combined(self) -> float:
+        """Standard uncertainty whether or not there is a further branch."""
+        return math.hypot(self.alone, self.shift)
+
+
+@dataclass(frozen=True)
 class FoundBranch:
     """A Maxwell branch: ratio (over the relaxed film) and time (s) with standard uncertainties; the time's is relative.
 
+    They are combined ones: a further branch that the record cannot show may stand beside it. ``ratio_alone`` and
+    ``time_alone`` are those if there is none; ``hidden`` (s) is the relaxation time of the one that does most where it
+    keeps the branch from being identified, else 0.
     ``verdict`` is "identified", "bounded" or "outside the window". ``ratios`` and ``times`` (s) are 95 % limits.
     """
 
@@ -35,33 +56,41 @@ class FoundBranch:
     verdict: str
     ratios: tuple[float, float]
     times: tuple[float, float]
+    ratio_alone: float
+    time_alone: float
+    hidden: float = 0.0
 
     @classmethod
-    def judged(
-        cls,
-        ratio: float,
-        ratio_uncertainty: float,
-        time: float,
-        time_relative: float,
-        window: tuple[float, float],
-        *,
-        explained: bool,
-    ) -> FoundBranch:
-        """With its verdict and limits, from standard uncertainties and the times that the record can show (s).
+    def judged(cls, ratio: Known, log_time: Known, window: tuple[float, float], *, explained: bool) -> FoundBranch:
+        """With its verdict and limits, from the times that the record can show (s).
 
         None is identified by a fit that does not predict what is left out (``explained``).
         """
-        low, high = window
-        if not math.log(low) + EDGE < math.log(time) < math.log(high) - EDGE:
-            word = "outside the window"
-        elif explained and ratio_uncertainty <= KNOWN_RATIO * ratio and time_relative <= KNOWN_TIME:
-            word = "identified"
-        else:
-            word = "bounded"
-        wide = min(1.96 * time_relative, 50.0)
-        ratios = max(0.0, ratio - 1.96 * ratio_uncertainty), ratio + 1.96 * ratio_uncertainty
-        times = time * math.exp(-wide), time * math.exp(wide)
-        return cls(ratio, ratio_uncertainty, time, time_relative, word, ratios, times)
+        low, high = (math.log(one) for one in window)
+        time = math.exp(log_time.value)
+        inside = low + EDGE < log_time.value < high - EDGE
+
+        def known(ratio_error: float, time_error: float) -> bool:
+            return inside and explained and ratio_error <= KNOWN_RATIO * ratio.value and time_error <= KNOWN_TIME
+
+        word = (
+            "identified" if known(ratio.combined, log_time.combined) else "bounded" if inside else "outside the window"
+        )
+        keeps = word == "bounded" and known(ratio.alone, log_time.alone)
+        most = ratio if ratio.combined > KNOWN_RATIO * ratio.value else log_time
+        wide = min(1.96 * log_time.combined, 50.0)
+        return cls(
+            ratio=ratio.value,
+            ratio_uncertainty=ratio.combined,
+            time=time,
+            time_relative=log_time.combined,
+            verdict=word,
+            ratios=(max(0.0, ratio.value - 1.96 * ratio.combined), ratio.value + 1.96 * ratio.combined),
+            times=(time * math.exp(-wide), time * math.exp(wide)),
+            ratio_alone=ratio.alone,
+            time_alone=log_time.alone,
+            hidden=most.near if keeps else 0.0,
+        )
 
 
 @dataclass(frozen=True)
@@ -208,6 +237,12 @@ class Spectrum:
                 f"branch: ratio {one.ratio:.3g} +- {one.ratio_uncertainty:.1g}, time {one.time:.3g} s (95 %: {low:.3g} "
                 f"to {high:.3g} s): {one.verdict}"
             )
+            if one.hidden > 0.0:
+                words.append(
+                    f"a further branch near {one.hidden:.2g} s, which this record cannot show, could change that of "
+                    f"{one.time:.3g} s; without it the ratio is known to +- {one.ratio_alone:.1g}, the time to "
+                    f"{100.0 * one.time_alone:.1g} %: move faster, and hold longer"
+                )
         if self.branches and not self.counts[-1].left_out.explained:
             words.append(
                 f"a part of the record that was left out is predicted to {self.counts[-1].left_out.expected:.1f} times "
@@ -240,6 +275,9 @@ class Spectrum:
                     "ratio_standard_uncertainty": finite(one.ratio_uncertainty),
                     "time_s": one.time,
                     "time_relative_standard_uncertainty": finite(one.time_relative),
+                    "ratio_standard_uncertainty_without_further_branch": finite(one.ratio_alone),
+                    "time_relative_standard_uncertainty_without_further_branch": finite(one.time_alone),
+                    "hidden_branch_near_s": one.hidden,
                     "ratio_interval_95": [finite(end) for end in one.ratios],
                     "time_interval_95_s": [finite(end) for end in one.times],
                     "verdict": one.verdict,

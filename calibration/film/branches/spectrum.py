@@ -17,11 +17,14 @@ from calibration.film.branches.counting import (
     Count,
     counted,
     free_columns,
+    further_times,
     gain,
     grid,
+    hidden,
     misfit,
     pays,
     shows_from,
+    unknown_columns,
 )
 from calibration.film.branches.joint import SOFTENING, Joint, Point, State
 from calibration.film.branches.response import with_branches
@@ -200,11 +203,24 @@ def unseen(joint: Joint, point: Point, scale: float, *, alone: bool = False) -> 
         first, count = len(joint.coordinates.names), joint.count(point.x)
         free[first : first + 2 * count] = False
     times = grid(joint, DECADES_BEYOND)
-    film = joint.film(point.x)
-    shapes = np.concatenate([one.added(film, times) for one in joint.responses], axis=1) / joint.sigma
-    rows = np.concatenate((np.where(joint.kept, shapes, 0.0), np.zeros((times.size, len(joint.nuisances)))), axis=1)
+    rows = _added(joint, point, times)
     sizes = shows_from(point, free, rows, scale)
     return [Unseen(float(time), size, row) for time, size, row in zip(times, sizes, rows, strict=True)]
+
+
+def _added(joint: Joint, point: Point, times: Array) -> Array:
+    """What branches of ratio one add to the residuals (times, residuals)."""
+    film = joint.film(point.x)
+    shapes = np.concatenate([one.added(film, times) for one in joint.responses], axis=1) / joint.sigma
+    nothing = np.zeros((times.size, len(joint.nuisances)))
+    return np.concatenate((np.where(joint.kept, shapes, 0.0), nothing), axis=1)
+
+
+def beside(joint: Joint, point: Point, scale: float, last: float) -> tuple[Array, Array]:
+    """Relaxation times (s) of branches that may hide beside those found, and what each adds to the residuals."""
+    first, count = len(joint.coordinates.names), joint.count(point.x)
+    times = further_times(joint, np.exp(point.x[first + count : first + 2 * count]), last)
+    return times, hidden(point, free_columns(joint, point), _added(joint, point, times), scale)
 
 
 def covariance(joint: Joint, point: Point) -> Covariance:
@@ -214,4 +230,4 @@ def covariance(joint: Joint, point: Point) -> Covariance:
     known = np.eye(last - first, point.x.size, first)
     if width.size:
         known = known * (math.sqrt(12.0) / width)[:, None]
-    return Covariance(np.concatenate((point.jacobian, known)), free_columns(joint, point))
+    return Covariance(np.concatenate((point.jacobian, known)), unknown_columns(joint, point))

@@ -16,8 +16,10 @@ from calibration.film.branches.counting import (
     Count,
     counted,
     free_columns,
+    further_times,
     gain,
     grid,
+    hidden,
     pays,
     shows_from,
 )
@@ -89,6 +91,16 @@ def unseen(problem: TimedProblem, point: Point, scale: float) -> list[tuple[floa
     n, k = problem.numbers, problem.count(point.x)
     free[n : n + 2 * k] = False
     times = grid(problem, DECADES_BEYOND)
+    return list(zip(times.tolist(), shows_from(point, free, _added(problem, point, times), scale), strict=True))
+
+
+def _added(problem: TimedProblem, point: Point, times: Array) -> Array:
+    """What branches of ratio one add to the residuals (times, residuals)."""
     _, added = problem.of_one(problem.split(point.x)[0], times)
-    rows = np.concatenate((added / problem.sigma, np.zeros((times.size, len(problem.records)))), axis=1)
-    return list(zip(times.tolist(), shows_from(point, free, rows, scale), strict=True))
+    return np.concatenate((added / problem.sigma, np.zeros((times.size, len(problem.records)))), axis=1)
+
+
+def beside(problem: TimedProblem, point: Point, scale: float, last: float) -> tuple[Array, Array]:
+    """Relaxation times (s) of branches that may hide beside those found, and what each adds to the residuals."""
+    times = further_times(problem, problem.split(point.x)[2], last)
+    return times, hidden(point, free_columns(problem, point), _added(problem, point, times), scale)

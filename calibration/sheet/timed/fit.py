@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.film.branches.counting import Count, free_columns, misfit
-from calibration.film.branches.result import HOLD, BranchCount, FoundBranch, Spectrum, blind_times
+from calibration.film.branches.counting import Count, free_columns, misfit, shifted, unknown_columns
+from calibration.film.branches.result import HOLD, BranchCount, FoundBranch, Known, Spectrum, blind_times
 from calibration.film.propagation import Covariance
 from calibration.film.result import Quantity, verdict
 from calibration.sheet.search import minima
 from calibration.sheet.sheet_tests import HomogeneousTest, TestsError
-from calibration.sheet.timed.count import count_branches, unseen
+from calibration.sheet.timed.count import beside, count_branches, unseen
 from calibration.sheet.timed.predict import predict_sheets, trace_of
 from calibration.sheet.timed.problem import ZERO, Point, TimedProblem
 from calibration.sheet.timed.result import SheetTrace, TimedFit
@@ -78,7 +78,7 @@ class _Found:
         self.problem, self.tried, self.numerical = problem, tried, numerical
         self.point = tried[-1].point
         self.scale = misfit(problem, self.point)
-        self.covariance = Covariance(self.point.jacobian, free_columns(problem, self.point))
+        self.covariance = Covariance(self.point.jacobian, unknown_columns(problem, self.point))
 
     def budget(self, gradient: Array) -> dict[str, float]:
         """Independent parts of the standard uncertainty of a function of x with this gradient."""
@@ -126,17 +126,21 @@ class _Found:
             if name not in problem.elastic.fixed
         }
 
-    def branches(self) -> tuple[FoundBranch, ...]:
-        """Each with its verdict, the quickest first."""
-        problem, x = self.problem, self.point.x
-        _, ratio, time, _ = problem.split(x)
+    def known(self, k: int, value: float, hidden: tuple[Array, Array]) -> Known:
+        """The k-th entry of x, with what branches that may hide make of it."""
+        unit = np.eye(self.point.x.size)[k]
+        shift = shifted(unit @ self.covariance.response, *hidden)
+        return Known(value, math.hypot(*self.budget(unit).values()), *shift)
+
+    def branches(self, last: float) -> tuple[FoundBranch, ...]:
+        """Each with its verdict, the quickest first; what takes longer than ``last`` (s) counts as stiffness."""
+        problem, n = self.problem, self.problem.numbers
+        _, ratio, time, _ = problem.split(self.point.x)
+        hidden = beside(problem, self.point, self.scale, last)
         found = []
-        for k in range(ratio.size):
-            units = np.eye(x.size)[[problem.numbers + k, problem.numbers + ratio.size + k]]
-            errors = [math.hypot(*self.budget(unit).values()) for unit in units]
-            known = self.tried[-1].left_out.explained
-            numbers = float(ratio[k]), errors[0], float(time[k]), errors[1]
-            found.append(FoundBranch.judged(*numbers, problem.window, explained=known))
+        for k, (one, tau) in enumerate(zip(ratio.tolist(), time.tolist(), strict=True)):
+            both = self.known(n + k, one, hidden), self.known(n + ratio.size + k, math.log(tau), hidden)
+            found.append(FoundBranch.judged(*both, problem.window, explained=self.tried[-1].left_out.explained))
         return tuple(sorted(found, key=lambda one: one.time))
 
     def spectrum(self) -> Spectrum:
@@ -148,7 +152,7 @@ class _Found:
         at_once[problem.numbers : problem.numbers + ratio.size] += shear
         slow, quick = blind_times(unseen(problem, self.point, self.scale), problem.window[1])
         return Spectrum(
-            branches=self.branches(),
+            branches=self.branches(slow),
             window=problem.window,
             instant=self.quantity((1.0 + float(ratio.sum())) * float(shear), at_once, "Pa"),
             counts=tuple(BranchCount(one.branches, one.aicc, one.left_out) for one in self.tried),

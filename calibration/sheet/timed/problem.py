@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.film.branches.counting import searched
 from calibration.sheet.problem import SheetProblem
 from calibration.sheet.sheet_tests import HomogeneousTest
 from calibration.sheet.timed.record import Bins, SheetRecord, steps_of
@@ -130,7 +131,7 @@ class TimedProblem:
         """Limits of a search from ``x``."""
         low, high = self.elastic.bounds(x[: self.numbers])
         k, zeros = self.count(x), len(self.records)
-        first, last = (math.log(one) for one in self.window)
+        first, last = searched(self.window)
         return (
             np.concatenate((low, np.zeros(k), np.full(k, first), np.full(zeros, -np.inf))),
             np.concatenate((high, np.full(k, MOST_RATIO), np.full(k, last), np.full(zeros, np.inf))),

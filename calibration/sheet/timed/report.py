@@ -96,11 +96,19 @@ def _branches(fit: TimedFit) -> dict[str, Any]:
     rows = []
     for one in fit.spectrum.branches:
         ratio, error = rounded(one.ratio, one.ratio_uncertainty)
-        rows.append((f"{one.time:.3g}", f"{one.times[0]:.3g} to {one.times[1]:.3g}", ratio, error, one.verdict))
+        limits, alone = f"{one.times[0]:.3g} to {one.times[1]:.3g}", f"{one.ratio_alone:.2g}"
+        rows.append((f"{one.time:.3g}", limits, ratio, error, alone, one.verdict))
     low, high = fit.spectrum.window
     return {
         "title": "Branches",
-        "names": ("time / s", "95 % limits / s", "ratio", "standard uncertainty", "verdict"),
+        "names": (
+            "time / s",
+            "95 % limits / s",
+            "ratio",
+            "standard uncertainty",
+            "if no further branch hides",
+            "verdict",
+        ),
         "rows": rows,
         "caption": f"Relaxation times from {low:.2g} s to {high:.3g} s can show in these tests.",
     }

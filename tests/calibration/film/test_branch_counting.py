@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from calibration.film.branches.counting import left_out
-from calibration.film.branches.result import LeftOut
+from calibration.film.branches.counting import hidden, left_out, shifted
+from calibration.film.branches.result import FoundBranch, Known, LeftOut
 
 Array = NDArray[np.float64]
 
@@ -77,3 +79,34 @@ def test_a_part_that_goes_another_way_is_not_explained() -> None:
     for seed in range(20):
         assert not judged(seed, bent).explained
         assert judged(seed, bent).expected > 2.0
+
+
+WINDOW = (0.02, 200.0)
+
+
+@pytest.mark.parametrize(("angle", "least", "most"), [(0.01, 0.1, 0.9), (0.3, 0.02, 0.2), (1.5, 1e-4, 3e-3)])
+def test_a_hidden_branch_shifts_by_what_it_looks_like_and_the_data_allow(
+    angle: float, least: float, most: float
+) -> None:
+    """A shape that is the found one's but for an angle: unseen it shifts that fully; seen, not to be there, hardly."""
+    along, other = np.eye(100)[:2] * 30.0
+    made = Line(along[:, None], STRETCHES, 2.0 * along)
+    free = np.array([True, False])
+    shape = np.atleast_2d(np.append(math.cos(angle) * along + math.sin(angle) * other, 0.0))
+    rows = hidden(made, free, shape, 1.0)
+    shift, near = shifted(-np.append(along, 0.0) / (along @ along), np.array([0.1]), rows)
+    assert near == 0.1
+    assert least < shift < most
+
+
+def test_the_verdict_is_that_of_the_combined_figure() -> None:
+    log_time = Known(math.log(2.0), 0.01)
+    sure, shaken = (
+        FoundBranch.judged(Known(1.0, 0.01, one, 0.1), log_time, WINDOW, explained=True) for one in (0.1, 0.2)
+    )
+    assert (sure.verdict, sure.hidden) == ("identified", 0.0)
+    assert (shaken.verdict, shaken.hidden) == ("bounded", 0.1)
+    assert shaken.ratio_alone == 0.01
+    assert shaken.ratio_uncertainty == pytest.approx(math.hypot(0.01, 0.2))
+    unsure = FoundBranch.judged(Known(1.0, 0.3, 0.2, 0.1), log_time, WINDOW, explained=True)
+    assert (unsure.verdict, unsure.hidden) == ("bounded", 0.0)

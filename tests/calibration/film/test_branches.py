@@ -16,7 +16,7 @@ from calibration.film.branches.joint import Joint
 from calibration.film.branches.polygon import Stretches, through
 from calibration.film.branches.record import Record
 from calibration.film.branches.response import Motion, Relaxed
-from calibration.film.branches.result import BranchCount, FoundBranch, LeftOut, Spectrum
+from calibration.film.branches.result import BranchCount, FoundBranch, Known, LeftOut, Spectrum
 from calibration.film.branches.spectrum import count_branches, covariance
 from calibration.film.curve import Curve
 from calibration.film.identify import identify
@@ -143,7 +143,7 @@ def test_an_elastic_fit_imports_nothing_of_branches() -> None:
 
 
 def test_sentences_come_from_the_facts() -> None:
-    one = FoundBranch(0.1, 0.01, 30.0, 0.1, "identified", (0.08, 0.12), (25.0, 36.0))
+    one = FoundBranch(0.1, 0.01, 30.0, 0.1, "identified", (0.08, 0.12), (25.0, 36.0), 0.01, 0.1)
     stiff = Quantity(2e5, 2e3, "Pa", {}, GOOD)
     said = Spectrum(
         (one,), (0.02, 600.0), stiff, (BranchCount(1, 0.0, LeftOut(1.0, 1.0, 1.0)),), 1000.0, 1200.0, 0.02
@@ -294,9 +294,48 @@ def test_where_a_film_hangs_slack_its_forces_are_left_out() -> None:
 
 @pytest.mark.parametrize("explained", [True, False])
 def test_no_branch_counts_as_identified_where_left_out_parts_are_not_predicted(explained: bool) -> None:
-    found = FoundBranch.judged(1.062, 0.0122, 0.564, 0.014, (0.02, 214.0), explained=explained)
+    both = Known(1.062, 0.0122), Known(math.log(0.564), 0.014)
+    found = FoundBranch.judged(*both, (0.02, 214.0), explained=explained)
     assert found.verdict == ("identified" if explained else "bounded")
     left = LeftOut(2.08, 1.03 if explained else 2.0, 0.4 if explained else 1e-9)
     stiffness = Quantity(1e5, 1e3, "Pa", {}, GOOD)
     spectrum = Spectrum((found,), (0.02, 214.0), stiffness, (BranchCount(1, 0.0, left),), 1000.0, 1200.0, 0.0)
     assert any("none counts as identified" in one for one in spectrum.sentences) is not explained
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(("noise", "seed"), [(1e-3, 1), (1e-3, 2), (4e-3, 1)])
+def test_a_branch_with_a_quick_one_folded_into_it_is_known_no_better_than_that(noise: float, seed: int) -> None:
+    """The quick branch is not found; alone, its neighbour's figure is off by many of its uncertainties."""
+    ratio, time = 0.93, 0.61
+    cone = ViscousCone(branches=((0.38, 0.1), (ratio, time)), **ONE_TERM)
+    curves = run(cone, paper((0.0,), hold=10.0, speed=3e-3), seed, rate=50.0, noise=(noise, 2e-6, 2.0))
+    found, _ = identify_branches(records(curves), curves, terms=1)
+    assert found.spectrum is not None
+    (branch,) = found.spectrum.branches
+    assert branch.ratio - ratio > 2.5 * branch.ratio_alone
+    assert abs(branch.ratio - ratio) < 2.5 * branch.ratio_uncertainty
+    assert abs(math.log(branch.time / time)) < 2.5 * branch.time_relative
+    known = branch.ratio_uncertainty < 0.15 * branch.ratio
+    assert branch.verdict == ("identified" if known else "bounded")
+    assert any("a further branch near 0.1" in one for one in found.spectrum.sentences) is not known
+    assert known is (noise < 2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_branch_that_outlasts_its_record_is_not_held_at_the_end_of_it() -> None:
+    """Held there it would bend the law, and be certain of itself."""
+    cone = ViscousCone(branches=((0.4, 60.0),), **ONE_TERM)
+    curves = run(cone, paper((0.0, 1500.0), hold=10.0, speed=3e-3), 3, rate=50.0)
+    found, _ = identify_branches(records(curves), curves, terms=1)
+    assert found.spectrum is not None
+    (branch,) = found.spectrum.branches
+    assert found.spectrum.window[1] < 50.0
+    assert branch.verdict == "outside the window"
+    assert abs(branch.ratio - 0.4) < 3.0 * branch.ratio_uncertainty
+    assert abs(math.log(branch.time / 60.0)) < 3.0 * branch.time_relative
+    eps, stiff = found.quantities["eps_r"], found.quantities["stiffness_fixed"]
+    assert abs(eps.value - cone.eps_r) < 3.0 * eps.uncertainty
+    assert abs(stiff.value - relaxed_stiffness(cone, found)) < 3.0 * stiff.uncertainty
