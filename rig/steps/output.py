@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 
 from drivers.roles import HVFlag
 from rig.base.errors import FaultError
 from rig.operator.control import Question
-from rig.safety.guard import SAFE_VOLTAGE, TRIP, GuardState, flag_names
+from rig.safety.guard import SAFE_VOLTAGE, TRIP, AnyGuard, GuardState, flag_names
 from rig.steps.base import ALLOWED_S, Turns, allowed
 from rig.steps.rig import Rig
 from rig.steps.turns import wait
@@ -63,11 +64,12 @@ def _clear_faults(rig: Rig) -> Turns:
     flags = guard.last.flags & TRIP
     if flags & ~rig.latched_at_start:
         said = ""
-    if not said:
+    while not said:
         if rig.control.unattended:
             raise _latched(rig, flags)
-        words = f"hv: the supply has latched: {flag_names(flags)}. Cause found and removed?"
-        said = str((yield from rig.ask(Question(words, expected="clear"))))
+        said, seen = yield from _ask_to_clear(rig, guard, flags)
+        if seen & ~flags:  # it has a cause of its own
+            said, flags = "", seen
     guard.clear_faults(said)
     rig.latched_at_start = HVFlag(0)
     rig.event("hv", f"cleared by {said}: {flag_names(flags)}")
@@ -77,6 +79,19 @@ def _clear_faults(rig: Rig) -> Turns:
         return guard.last is not last and guard.last is not None and not guard.last.flags & TRIP
 
     yield from wait(rig, gone, ALLOWED_S, f"hv: the end of {flag_names(flags)} after it was cleared")
+
+
+def _ask_to_clear(rig: Rig, guard: AnyGuard, flags: HVFlag) -> Generator[None, None, tuple[str, HVFlag]]:
+    """His answer, and everything that showed until he gave it, gone again or not."""
+    asking = rig.ask(Question(f"hv: the supply has latched: {flag_names(flags)}. Cause found and removed?", "clear"))
+    while True:
+        try:
+            next(asking)
+        except StopIteration as answered:
+            return str(answered.value), flags
+        if guard.last is not None:
+            flags |= guard.last.flags & TRIP
+        yield
 
 
 def refuse_latched(rig: Rig) -> None:

@@ -294,6 +294,26 @@ def test_somebody_there_is_asked_about_what_has_latched_beside_that(tell: Tell) 
     assert "clear" not in commands(story)[4:] and said_in(story, "cleared by 'clear', by a person: ")
 
 
+def test_what_latches_while_he_is_asked_is_asked_about_before_anything_is_cleared(tell: Tell) -> None:
+    """He answers late: somebody has opened the interlock meanwhile, and closed it again."""
+    asked: list[str] = []
+
+    def script(control: Control) -> list[str]:
+        if control.question is None or control.answer is not None:
+            return []
+        asked.append(control.question.text)
+        return answers(control) if "latched" not in asked[-1] or asked.count(asked[-1]) > 100 else []
+
+    faults = OPEN_ONCE + LATER.replace("inhibit", "interlock").replace("2.5", "3.0").replace("0.01", "1.0")
+    story = tell(control=Control([Operator(script)]), replace=("[simulation.film]", f"{faults}[simulation.film]"))
+    assert story.outcome.status == "complete", story.outcome.reason
+    print([(m.fields["t_s"], m.fields["message"]) for m in read_log(story.log).messages("/event")][:12])
+    first, second, *_ = dict.fromkeys(text for text in asked if "latched" in text)
+    assert first.startswith("hv: the supply has latched: inhibited, fault. "), first
+    assert "inhibited" in second and "interlock open" in second
+    assert commands(story)[:3] == ["asked", "asked", "clear"]
+
+
 IN_MEMORY = (
     TO_THE_FILM
     + """[[step]]

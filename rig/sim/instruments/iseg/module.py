@@ -335,14 +335,16 @@ class IsegEDCP:
         return status
 
     def _module_status(self) -> int:
-        status = TEMPERATURE | SUPPLY | MODULE_GOOD | (LIMIT_GOOD if self._settings.limit_good_bit else 0)
+        status = TEMPERATURE | SUPPLY | (LIMIT_GOOD if self._settings.limit_good_bit else 0)
         events = self._event & self._event_mask or any(c.event & c.mask for c in self._channels)
+        no_sum_error = not any(c.event & BLOCKING for c in self._channels)
         for bit, true in (
             (KILL, self._kill),
             (EVENT_ACTIVE, bool(events)),
             (SAFETY_LOOP, not self._interlock_open),
             (NO_RAMP, not any(c.ramping for c in self._channels)),
-            (NO_SUM_ERROR, not any(c.event & BLOCKING for c in self._channels)),
+            (NO_SUM_ERROR, no_sum_error),
+            (MODULE_GOOD, no_sum_error and not self._event & (TEMPERATURE | SUPPLY | SAFETY_LOOP)),
             (MODULE_INPUT_ERROR, self._input_error),
             (HV_ON, any(c.on for c in self._channels)),
             (FINE, self._fine),

@@ -230,7 +230,11 @@ def test_open_safety_loop_takes_the_output_off_and_blocks_until_cleared(host):
     supply.open_interlock(host.t, False)
     host.can("200#4001000008")
     assert not status(host) & ON
+    safety_loop_good, module_good = 1 << 10, 1 << 12
+    module = int(host.can("201#1000")[0][-4:], 16)  # the latched event keeps the module from being good
+    assert module & safety_loop_good and not module & module_good
     host.can("200#10020400")
+    assert int(host.can("201#1000")[0][-4:], 16) & module_good
     host.can("200#4001000008")
     assert status(host) & ON
 
