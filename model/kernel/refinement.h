@@ -10,6 +10,8 @@ enum {
 };
 #define NEWTON_FACTOR 0.3
 #define LEVEL_FACTOR 0.5
+#define TAIL_FACTOR 2.0
+#define FELT 0.6
 #define ROUND_OFF 1e-13
 #define LEAST_SHARE 0.15
 #define CLEARLY_NEGATIVE (-1e-2)
@@ -34,7 +36,7 @@ enum {
 /* A state after Newton at one resolution. */
 typedef struct {
     Real lam;
-    Real change; /* largest relative change of a slope in the last step */
+    Real change; /* largest relative change of a slope or of the meridional stress in the last step */
     Real tail;   /* share of the energy that the last modes carry */
     Real hoop;   /* least hoop over largest meridional stress at the points, before the last step */
     Whole steps;
@@ -44,24 +46,33 @@ typedef struct {
 /* Change of a slope at which Newton's error is just below the tolerance. */
 static double goal(double tolerance) { return fmin(0.03, fmax(1e-6, sqrt(0.9 * tolerance / NEWTON_FACTOR))); }
 
-/* Estimated relative error of `now`, after the force `previous` at the resolution before. */
-static Real estimate(const Iterate *now, Real previous, double tolerance, double factor) {
-    Real refined = factor * abs_of((now->lam - previous) / now->lam);
-    return refined + NEWTON_FACTOR * (now->change * now->change) + now->tail + (ROUND_OFF + LEAST_SHARE * tolerance);
+/* Estimated relative error of `now`, after the force `previous` at the resolution before, with the tail `before`; NaN
+   where there was none. */
+static Real estimate(const Iterate *now, Real previous, Real before, double tolerance, double factor) {
+    Real truncated = factor * abs_of((now->lam - previous) / now->lam) + now->tail;
+    truncated = larger(truncated, TAIL_FACTOR * sqrt_of(now->tail * before));
+    return truncated + NEWTON_FACTOR * (now->change * now->change) + (ROUND_OFF + LEAST_SHARE * tolerance);
+}
+
+/* Relative change of the meridional stress at a point by a step. */
+static inline Real stressed(const Points *at, int64_t i, Real de, Real dq, Real dw) {
+    const Stress *law = &at->law;
+    return (law->h11[i] * (at->along[i] * dq + at->down[i] * dw) + law->h12[i] * (at->around[i] * de)) / law->t1[i];
 }
 
 /* Add a step to the state in the lanes that are `open`, shortened where a slope would change beyond reason. Returns the
-   largest relative change, which counts for more where the tension is a small rest of elastic and Maxwell stress; NaN
-   where there is none. */
+   largest relative change of a slope or of the meridional stress; NaN where there is none. */
 static Real advance(const Problem *problem, const Grid *grid, const Points *at, const Step *step, Mask open,
                     State *state) {
     int64_t points = grid->table->points, modes = grid->table->modes;
-    Real change = of(0.0), share = of(1.0), sum = step->lam;
+    Real change = of(0.0), felt = of(0.0), share = of(1.0), sum = step->lam;
     Mask charged = problem->field != 0.0;
     for (int64_t i = 0; i < points; i++) {
         change = larger(change, abs_of(step->dw[i] / state->w[i]));
+        felt = larger(felt, abs_of(stressed(at, i, step->de[i], step->dq[i], step->dw[i])));
         sum += step->dw[i];
     }
+    felt = FELT * larger(felt, change);
     if (any(charged)) {
         for (int64_t i = 0; i < points; i++) share = larger(share, abs_of(at->law.maxwell[i] / at->law.t1[i]));
         change = pick(charged, change * sqrt_of(share), change);
@@ -74,7 +85,7 @@ static Real advance(const Problem *problem, const Grid *grid, const Points *at, 
         state->w[i] = pick(open, moved, w);
     }
     for (int64_t k = 0; k < modes; k++) state->c[k] = pick(open, state->c[k] + part * step->dc[k], state->c[k]);
-    return pick(finite(sum), change, of(NAN));
+    return pick(finite(sum), felt, of(NAN));
 }
 
 /* Energy of the last mode and a tenth of that of the last but one, over F h. */
@@ -143,7 +154,7 @@ static void prolong(const Table *from, const Table *to, const double *matrix, St
    place, or none. `relaxed`: a state whose hoop stress is clearly negative is FOLDED at once. */
 static int settle_plain(Problem *problem, const Table *const *tables, double tolerance, int relaxed, Grid *grid,
                         State *state, Iterate *found, double *error) {
-    double aim = goal(tolerance), previous = NAN;
+    double aim = goal(tolerance), previous = NAN, before = NAN;
     int64_t steps = 0;
     for (;;) {
         *found = newton(problem, grid, state, aim, MOST_STEPS);
@@ -151,9 +162,10 @@ static int settle_plain(Problem *problem, const Table *const *tables, double tol
         found->steps = steps;
         if (relaxed && found->hoop <= CLEARLY_NEGATIVE) return FOLDED;
         if (!found->ok) return UNSETTLED;
-        *error = estimate(found, previous, tolerance, LEVEL_FACTOR);
+        *error = estimate(found, previous, before, tolerance, LEVEL_FACTOR);
         if (*error <= tolerance) return TAUT;
         previous = found->lam;
+        before = found->tail;
         const Table *now = grid->table;
         if (now->next > MOST_MODES) return UNSETTLED;
         if (!tables[now->next]) return NEEDS_TABLE;

@@ -95,6 +95,7 @@ typedef struct {
 /* One Newton step: the change of the state and the force after it. */
 typedef struct {
     Real dc[MOST_FUNCTIONS], dw[MOST_POINTS];
+    Real de[MOST_POINTS], dq[MOST_POINTS]; /* that make up dc */
     Real lam;
     Mask stable;
 } Step;
@@ -297,9 +298,9 @@ static void substitute(int64_t n, const Real *matrix, Real *x) {
     }
 }
 
-/* How the slopes follow a change `dc` of the modes with the force `lam`. */
-static void slopes(const Grid *grid, const Reduced *system, const Real *dc, Real lam, int gradient, Real *dw) {
-    Real de[MOST_POINTS], dq[MOST_POINTS];
+/* How the slopes follow a change `dc` of the modes, and so of the strains, with the force `lam`. */
+static void slopes(const Grid *grid, const Reduced *system, const Real *dc, Real lam, int gradient, Real *de, Real *dq,
+                   Real *dw) {
     strain(grid, dc, de, dq);
     for (int64_t i = 0; i < grid->table->points; i++) { /* vector */
         Real rest = lam / grid->radius[i] - (gradient ? system->gw[i] : of(0.0));
@@ -331,7 +332,7 @@ static void newton_step(const Problem *problem, const Grid *grid, const Real *w,
     substitute(modes, system->matrix, step->dc);
     step->lam = lam0 + dot(modes, system->coupling, step->dc) / system->give;
     step->stable = positive & system->positive;
-    slopes(grid, system, step->dc, step->lam, 1, step->dw);
+    slopes(grid, system, step->dc, step->lam, 1, step->de, step->dq, step->dw);
 }
 
 /* The derivative of the state and of the force with respect to h/b, from a factored system. */
@@ -340,7 +341,7 @@ static void tangent(const Grid *grid, const Reduced *system, Step *by_height) {
     for (int64_t k = 0; k < modes; k++) by_height->dc[k] = -(system->coupling[k] / system->give);
     substitute(modes, system->matrix, by_height->dc);
     by_height->lam = (1.0 + dot(modes, system->coupling, by_height->dc)) / system->give;
-    slopes(grid, system, by_height->dc, by_height->lam, 0, by_height->dw);
+    slopes(grid, system, by_height->dc, by_height->lam, 0, by_height->de, by_height->dq, by_height->dw);
 }
 
 /* A first state: r = R, and slopes that follow the power law w ~ R^(-1/n) of the film at its mean slope. */

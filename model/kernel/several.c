@@ -15,7 +15,7 @@ typedef struct {
     Problem problem;
     Grid grid; /* of the plain state */
     State state;
-    Real previous;
+    Real previous, tail_before;
 } Pack;
 
 static Mask lanes_where(const Pack *pack, int64_t status) {
@@ -39,6 +39,7 @@ static void take_up(Pack *pack) {
         problem->span[k] = posed->span;
         problem->height[k] = posed->height;
         pack->previous[k] = pack->of[k]->previous;
+        pack->tail_before[k] = pack->of[k]->tail_before;
     }
     problem->counts = lanes_where(pack, pack->of[0]->status);
     problem->mechanical = problem->electric = problem->relaxed = counted(problem->counts, 0);
@@ -142,7 +143,7 @@ static void seek_zones(Pack *pack) {
         if (!zones_now(&whole, (const Real(*)[FINE])fine, of(0.0), 0.0, k, &one->zones)) continue;
         one->modes = modes_for(&one->zones, pack->task->first_modes);
         one->status = begun_at(pack->task, one->modes);
-        one->previous = NAN;
+        one->previous = one->tail_before = NAN;
         one->before = INFINITY;
     }
 }
@@ -159,12 +160,13 @@ static void settle_several(Pack *pack, int64_t modes) {
     else
         go_on(pack);
     Iterate found = newton(&pack->problem, &pack->grid, &pack->state, goal(task->tolerance), MOST_STEPS);
-    Real error = estimate(&found, pack->previous, task->tolerance, LEVEL_FACTOR);
+    Real error = estimate(&found, pack->previous, pack->tail_before, task->tolerance, LEVEL_FACTOR);
     for (int64_t k = 0; k < pack->members; k++) {
         One *one = pack->of[k];
         if (one->status != OPEN) continue;
         one->steps += found.steps[k];
         one->lam = found.lam[k];
+        one->tail = found.tail[k];
         one->error = error[k];
         one->status = judged(task, table, found.hoop[k], found.ok[k], error[k]);
         count[0] += one->status == TAUT;
@@ -181,6 +183,7 @@ static void settle_several(Pack *pack, int64_t modes) {
     for (int64_t k = 0; k < pack->members; k++) {
         if (pack->of[k]->status != OPEN) continue;
         pack->of[k]->previous = pack->of[k]->lam;
+        pack->of[k]->tail_before = pack->of[k]->tail;
         put_down(pack, k, next);
     }
 }
@@ -258,11 +261,12 @@ static void settle_folding(Pack *pack, int64_t modes) {
     take_up(pack);
     cut_several(pack, table, &cut);
     Iterate found = settle(&pack->problem, &cut, goal(task->tolerance));
-    Real error = estimate(&found, pack->previous, task->tolerance, CUT_LEVEL_FACTOR);
+    Real error = estimate(&found, pack->previous, pack->tail_before, task->tolerance, CUT_LEVEL_FACTOR);
     for (int64_t k = 0; k < pack->members; k++) {
         One *one = pack->of[k];
         one->steps += found.steps[k];
         one->lam = found.lam[k];
+        one->tail = found.tail[k];
         one->error = error[k] + of_cones(&one->zones, one->before);
         if (fabs(one->previous) < INFINITY) one->before = fabs((one->lam - one->previous) / one->lam);
         one->status = !found.ok[k]                    ? LEFT_TO_OTHERS
@@ -278,6 +282,7 @@ static void settle_folding(Pack *pack, int64_t modes) {
     for (int64_t k = 0; k < pack->members; k++) {
         if (pack->of[k]->status != FOLDING) continue;
         pack->of[k]->previous = pack->of[k]->lam;
+        pack->of[k]->tail_before = pack->of[k]->tail;
         put_down_cut(&cut, k, pack->of[k]);
     }
 }
@@ -324,7 +329,7 @@ void SOLVE_SEVERAL(const Task *task, One *states, int64_t count) {
         one->modes = one->plain_modes = modes_to_begin_with(task, one->posed.span);
         one->status = task->tables[one->modes] ? OPEN : NEEDS_TABLE;
         one->steps = one->mechanical = one->electric = one->relaxed = one->slack = 0;
-        one->previous = NAN;
+        one->previous = one->tail_before = NAN;
     }
     advance_all(task, states, count, OPEN);
     advance_all(task, states, count, FOLDING);

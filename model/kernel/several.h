@@ -23,7 +23,7 @@ typedef struct {
     Posed posed;
     int64_t status; /* OPEN, FOLDING; then what `refine` says of it, SLACK or WRINKLED */
     int64_t slack, modes, steps, mechanical, electric, relaxed;
-    double lam, previous, before, error;
+    double lam, previous, tail, tail_before, before, error;
     /* The plain state. */
     int64_t plain_modes, plain_steps;
     double c[MOST_FUNCTIONS], w[MOST_POINTS];

@@ -69,7 +69,7 @@ static void compose(Problem *problem, const Cut *cut, int64_t own, Cone *cones, 
 
 /* What a step leaves: how much it changed, and the hoop tension of the panels after it. */
 typedef struct {
-    Real slopes, strains, size, bent, maxwell, bent_maxwell;
+    Real slopes, stressed, strains, size, bent, maxwell, bent_maxwell;
     Real tension[MOST_ELEMENTS][MOST_POINTS];
 } Changes;
 
@@ -78,11 +78,11 @@ static void turn(const Cut *cut, int64_t k, const Points *at, const Reduced *par
                  Real *dw, Changes *seen) {
     const Stress *law = &at->law;
     Real de[MOST_POINTS], dq[MOST_POINTS];
-    slopes(&cut->grid[k], part, dc, lam, 1, dw);
-    strain(&cut->grid[k], dc, de, dq);
+    slopes(&cut->grid[k], part, dc, lam, 1, de, dq, dw);
     for (int64_t i = 0; i < points_of(cut); i++) {
         Real w = cut->state[k].w[i];
         seen->slopes = larger(seen->slopes, abs_of(dw[i] / w));
+        seen->stressed = larger(seen->stressed, abs_of(stressed(at, i, de[i], dq[i], dw[i])));
         seen->strains = larger(seen->strains, abs_of(dq[i]));
         seen->size = larger(seen->size, abs_of(at->q[i]) + w * w);
         seen->maxwell = larger(seen->maxwell, abs_of(law->maxwell[i] / law->t1[i]));
@@ -133,7 +133,7 @@ static Real cut_step(Problem *problem, Cut *cut, Cone *cones, double aim, Mask o
     Spring spring[MOST_ELEMENTS];
     System system;
     Changes seen;
-    seen.slopes = seen.strains = seen.bent = of(0.0);
+    seen.slopes = seen.stressed = seen.strains = seen.bent = of(0.0);
     seen.size = of(1e-300);
     seen.maxwell = seen.bent_maxwell = of(1.0);
     Real dc[MOST_UNKNOWNS], dw[MOST_ELEMENTS][MOST_POINTS], local[MOST_FUNCTIONS], breaks[MOST_ELEMENTS + 1];
@@ -158,6 +158,7 @@ static Real cut_step(Problem *problem, Cut *cut, Cone *cones, double aim, Mask o
     }
     Real change = pick(problem->field != 0.0, seen.slopes * sqrt_of(seen.maxwell), seen.slopes);
     add_step(cut, own, dc, dw, change, open);
+    change = FELT * larger(seen.slopes, seen.stressed);
     change = larger(change, larger(CURVED * seen.bent * sqrt_of(seen.bent_maxwell), seen.strains / seen.size));
     Real shift = moved_breaks(cut, seen.tension, breaks);
     change = larger(change, larger(CUT_WEIGHT * shift, CUT_POWER * shift * sqrt_of(shift)));
@@ -383,7 +384,7 @@ static double of_cones(const Zones *zones, double before) {
    with the points in `at`. */
 static int refine_cut(Problem *problem, const Table *const *tables, int64_t modes, double tolerance, const Cut *old,
                       const Zones *zones, Cut *cut, Points *at, Iterate *found, double *error) {
-    double previous = NAN, before = INFINITY, aim = goal(tolerance);
+    double previous = NAN, tail_before = NAN, before = INFINITY, aim = goal(tolerance);
     int64_t steps = found->steps;
     cut->elements = zones->elements;
     memcpy(cut->folded, zones->folded, sizeof cut->folded);
@@ -399,10 +400,11 @@ static int refine_cut(Problem *problem, const Table *const *tables, int64_t mode
         steps += found->steps;
         found->steps = steps;
         if (!found->ok) return LEFT_TO_OTHERS;
-        *error = estimate(found, previous, tolerance, CUT_LEVEL_FACTOR) + of_cones(zones, before);
+        *error = estimate(found, previous, tail_before, tolerance, CUT_LEVEL_FACTOR) + of_cones(zones, before);
         if (fabs(previous) < INFINITY) before = fabs((found->lam - previous) / found->lam);
         if (*error <= tolerance) break;
         previous = found->lam;
+        tail_before = found->tail;
         modes = tables[modes]->next;
     }
     evaluate_cut(problem, cut, at);
@@ -438,7 +440,7 @@ static int fold(Problem *problem, const Table *const *tables, const int64_t *fir
 static void cut_derivatives(const Problem *problem, const Cut *cut, const Points *at, Real lam, Derivatives *out) {
     Reduced part[MOST_ELEMENTS];
     System system;
-    Real dc[MOST_UNKNOWNS], local[MOST_FUNCTIONS], dw[MOST_POINTS];
+    Real dc[MOST_UNKNOWNS], local[MOST_FUNCTIONS], de[MOST_POINTS], dq[MOST_POINTS], dw[MOST_POINTS];
     int64_t modes = modes_of(cut), own = cut->elements * modes;
     clear_system(&system, own + cut->elements - 1);
     for (int64_t k = 0; k < cut->elements; k++) {
@@ -454,7 +456,7 @@ static void cut_derivatives(const Problem *problem, const Cut *cut, const Points
     out->height = stiffness;
     for (int64_t k = 0; k < cut->elements; k++) {
         local_part(cut, dc, own, k * modes, k, local);
-        slopes(&cut->grid[k], &part[k], local, stiffness, 0, dw);
+        slopes(&cut->grid[k], &part[k], local, stiffness, 0, de, dq, dw);
         add_derivatives(problem, &cut->grid[k], cut->state[k].w, &at[k], cut->folded[k], lam, local, dw, stiffness,
                         out);
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,14 @@ MOST_MODES = 64
 FIRST_MODES = 36  # the most to begin with
 MOST_STEPS = 25
 # Newton's step leaves an error of about the square of its relative size; the change of the force from one resolution to
-# the next is the error of the coarser one, some times the error of the finer. Tests hold both factors to the truth.
+# the next is the error of the coarser one, some times the error of the finer. Tests hold the factors to the truth.
 NEWTON_FACTOR = 0.3
+FELT = 0.6  # of the largest relative change of a slope or of the meridional stress
 LEVEL_FACTOR = 0.5
 CUT_LEVEL_FACTOR = 2.0  # with cuts, which move from one resolution to the next
+# Two coarse resolutions may agree by chance while their last modes still carry energy. The geometric mean of their
+# tails stands between the energy that the coarser one leaves out and the finer one does.
+TAIL_FACTOR = 2.0
 # Near loss of convexity a finer resolution gains less, and of a film that is one cone two may agree by chance: the
 # change before counts as well.
 SOFT_BEFORE_FACTOR = 0.2
@@ -42,7 +46,7 @@ class Iterate:
     grid: Grid
     state: State
     lam: Array
-    change: Array  # largest relative change of a slope in the last step
+    change: Array  # largest relative change of a slope or of the meridional stress in the last step
     tail: Array  # share of the energy that the last modes carry
     stable: NDArray[np.bool_]
     ok: NDArray[np.bool_]
@@ -145,15 +149,13 @@ def goal(tolerance: float) -> float:
     return min(0.03, max(1e-6, math.sqrt(0.9 * tolerance / NEWTON_FACTOR)))
 
 
-Number = TypeVar("Number", float, Array)
-
-
 def estimate(
-    lam: Number, previous: Number, change: Number, tail: Number, tolerance: float, factor: float = LEVEL_FACTOR
-) -> Number:
-    """Estimated relative error of ``lam``, after ``previous`` at the resolution before; nan when there is none."""
-    refined = factor * abs((lam - previous) / lam)
-    return refined + NEWTON_FACTOR * change**2 + tail + (ROUND_OFF + LEAST_SHARE * tolerance)
+    lam: Array, previous: Array, change: Array, tails: tuple[Array, Array], tolerance: float, factor: float
+) -> Array:
+    """Estimated relative error of ``lam``, after ``previous`` at the resolution before, which had the second tail."""
+    tail, before = tails
+    truncated = np.maximum(factor * np.abs((lam - previous) / lam) + tail, TAIL_FACTOR * np.sqrt(tail * before))
+    return truncated + NEWTON_FACTOR * change**2 + (ROUND_OFF + LEAST_SHARE * tolerance)
 
 
 def next_modes(modes: int) -> int:
@@ -164,12 +166,17 @@ def next_modes(modes: int) -> int:
 def advance(state: State, step: ritz.Step, at: ritz.Points, grid: Grid) -> tuple[State, Array]:
     """The state after a Newton step, shortened where a slope would change beyond reason; and the largest change.
 
-    Where the tension is a small rest of elastic and Maxwell stress, the force feels the change that much more.
+    That is the relative one of a slope or of the meridional stress, as far as the force feels it: a law that stiffens,
+    or a tension that is a small rest of elastic and Maxwell stress, makes more of the same step.
     """
-    w = state.w
+    w, law = state.w, at.law
     change = np.abs(step.dw / w).max(axis=(0, 1), initial=0.0)
-    if at.law.maxwell is not None:
-        change *= np.sqrt(np.abs(at.law.maxwell / at.law.t1).max(axis=(0, 1), initial=1.0))
+    de, dq = grid.strain(step.dc)
+    along = at.along * dq + at.down * step.dw
+    stressed = (law.h11 * along + law.h12 * (at.around * de)) / law.t1
+    felt = FELT * np.maximum(change, np.abs(stressed).max(axis=(0, 1), initial=0.0))
+    if law.maxwell is not None:
+        change = change * np.sqrt(np.abs(law.maxwell / law.t1).max(axis=(0, 1), initial=1.0))
     short: Array | float = 1.0
     if not change.max() <= 0.8:
         short = np.where(change > 2.0, 2.0 / change, 1.0)
@@ -180,11 +187,10 @@ def advance(state: State, step: ritz.Step, at: ritz.Points, grid: Grid) -> tuple
         moved = w + step.dw
         c = state.c + step.dc
     natural = state.natural
-    relief = at.law.relief
+    relief = law.relief
     if natural is not None and relief is not None:
-        _, dq = grid.strain(step.dc)
-        natural = natural + relief.change + relief.rate * short * (at.along * dq + at.down * step.dw)
-    return State(c, moved, natural, state.relaxed), change
+        natural = natural + relief.change + relief.rate * short * along
+    return State(c, moved, natural, state.relaxed), felt
 
 
 def tail(problem: Problem, grid: Grid, state: State, step: ritz.Step) -> Array:
@@ -315,6 +321,7 @@ def refine(
     lost: list[NDArray[np.intp]] = []
     aim = goal(tolerance)
     previous: Array | None = None
+    tail_before = np.full(len(index), np.nan)
     before = np.full(len(index), np.inf)  # relative change of the force at the resolution before
     while True:
         result = settle(problem, start.grid, start.state, aim)
@@ -331,7 +338,7 @@ def refine(
             lost.append(index[~ok])
         modes = start.grid.table.modes
         if previous is not None:
-            error = estimate(lam, previous, result.change, result.tail, tolerance, factor)
+            error = estimate(lam, previous, result.change, (result.tail, tail_before), tolerance, factor)
             if soft:
                 error = error + SOFT_BEFORE_FACTOR * before
             before = np.abs((lam - previous) / lam)
@@ -355,7 +362,7 @@ def refine(
         if len(rest) < len(index):
             problem, index, start, lam = problem.take(rest), index[rest], start.take(rest), lam[rest]
             before = before[rest]
-        previous = lam
+        previous, tail_before = lam, result.tail[rest]
         start = prolonged(start, next_modes(modes))
     return answers, np.concatenate(lost), total
 

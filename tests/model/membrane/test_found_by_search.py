@@ -61,3 +61,52 @@ def test_a_soft_state_that_does_not_settle_from_few_modes_is_begun_with_more() -
                    for t in (1e-6, 1e-8))  # fmt: skip
     assert rough.status is fine.status is Status.WRINKLED
     assert abs(rough.force / fine.force - 1.0) <= rough.error_estimate + fine.error_estimate
+
+
+# Taut films whose first two resolutions agree by chance, and stiffening ones in which a small step of Newton leaves
+# more than its square, with voltage and without.
+COARSE = [
+    (Specimen(0.002808155072292662, 0.02, 6.19636670614087e-05, 1.088177943476491,
+              Material("two", (40713.88635160549, 1.3754320308438035), (1.724884009862802, 13.17666982029673), 3.0)),
+     0.013895226132631522, 916.2442730913692),
+    (Specimen(0.001062933426608048, 0.02, 2.672074267747159e-05, 1.8104472023021851,
+              Material("three", (65988.67844906347, -7077.332804866498, -1198.830662118592),
+                       (2.108713667916463, -1.99444279662465, -3.789447637249004), 3.0)),
+     0.008851578528757379, 751.3493568776499),
+    (Specimen(0.0019794055773619257, 0.02, 6.482864031758117e-05, 1.3350979735442627,
+              Material("mixed", (31991.717994176426, 0.39160707726580485, -402.50774530209935),
+                       (1.894360736574436, 14.289890334595134, -2.2418504535925083), 3.0)),
+     0.009944166409543452, 865.5575473501722),
+    (Specimen(0.003561110770767849, 0.02, 4e-05, 1.3814340571570374,
+              Material("treloar", (630000.0, 1200.0, -10000.0), (1.3, 5.0, -2.0), 2.4)),
+     0.008366561435835064, 724.9473017643398),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("film", "h", "voltage"), COARSE)
+def test_taut_films_are_within_the_stated_error_at_coarse_resolutions(film: Specimen, h: float, voltage: float) -> None:
+    truth = solve(film, h, voltage, tolerance=1e-10, wrinkling="tension_field")
+    for tolerance in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
+        found = solve(film, h, voltage, tolerance=tolerance, wrinkling="tension_field")
+        assert found.status is Status.TAUT
+        assert abs(found.force / truth.force - 1.0) <= found.error_estimate + truth.error_estimate
+
+
+def test_stiffening_films_are_within_a_share_of_the_stated_error() -> None:
+    """A thousand taut films with and without voltage: what Newton and the resolution leave, with room to spare."""
+    rng = np.random.default_rng(11)
+    films, h = [], []
+    for _ in range(1000):
+        law = (10 ** rng.uniform(4, 5), 10 ** rng.uniform(0, 3)), (rng.uniform(1.3, 3.0), rng.uniform(6.0, 16.0))
+        a = 0.02 * rng.uniform(0.06, 0.5)
+        films.append(Specimen(a, 0.02, 40e-6, rng.uniform(1.05, 2.5), Material("stiffens", *law, 3.0)))
+        h.append((0.02 - a) * rng.uniform(0.1, 1.5))
+    voltage = np.where(np.arange(1000) % 2, 300.0, 0.0)
+    truth = solve_many(films, np.array(h), voltage, tolerance=1e-11)
+    taut = truth.status == Status.TAUT
+    assert taut.sum() > 500
+    for tolerance in (1e-4, 1e-6, 1e-8):
+        found = solve_many(films, np.array(h), voltage, tolerance=tolerance)
+        share = (np.abs(found.force / truth.force - 1.0) / found.error_estimate)[taut]
+        assert share.max() < 1.0
+        assert np.quantile(share, 0.99) < 0.5
