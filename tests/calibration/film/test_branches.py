@@ -253,6 +253,7 @@ def test_a_fit_ends_where_the_exact_model_does_after_few_solutions() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long  # one that hangs slack on its only way back: the next test
 @pytest.mark.timeout(600)
 def test_a_film_that_is_slack_after_a_third_of_its_record_is_fitted_to_that_third() -> None:
     """It is slack on its first way back, before any voltage: no permittivity, and the branch as good as the rest."""

@@ -207,7 +207,7 @@ def test_wrinkling_starts_where_tension_is_lost_and_ends_where_the_film_is_slack
 
 def test_small_disk() -> None:
     small = Specimen(1e-4, 20e-3, 40e-6, 1.0, PARKER)
-    v = np.array([600.0, 1200.0])
+    v = np.array([1000.0])
     found = solve_many(small, 10e-3, v, wrinkling="tension_field", tolerance=1e-7)
     truth = reference(small, 10e-3, v, wrinkling="tension_field")
     assert found.answered.all()

