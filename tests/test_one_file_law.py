@@ -109,6 +109,7 @@ def test_solve_knows_it(package: Path) -> None:
     assert third["F"] > 1.1 * second["F"]
 
 
+@pytest.mark.slow
 def test_a_scene_with_it_is_checked_run_and_fitted(package: Path) -> None:
     scene, log, out = package / "scene.toml", package / "run.mcap", package / "fit.json"
     scene.write_text(SCENE.replace("CERTIFICATE", str(FIXTURES / "calibrations" / "force.toml")))

@@ -108,7 +108,7 @@ def test_legs_find_contact_where_one_motion_does_and_as_soon(
     assert legs.end <= one.end + 0.05
 
 
-@pytest.mark.parametrize(("speed", "leg"), [(0.1, 0.1e-3), (5.0, 2.5625e-3)])
+@pytest.mark.parametrize(("speed", "leg"), [pytest.param(0.1, 0.1e-3, marks=pytest.mark.slow), (5.0, 2.5625e-3)])
 def test_a_leg_is_half_a_second_and_the_braking_but_not_much_shorter_than_what_a_stage_resolves(
     tell: Tell, ways: list[Way], speed: float, leg: float
 ) -> None:

@@ -33,7 +33,7 @@ def results(story: Any) -> dict[str, dict[str, Any]]:
     return {m.fields["name"]: m.fields for m in read_log(story.log).messages("/result")}
 
 
-@pytest.mark.parametrize("rate", [None, 100.0])
+@pytest.mark.parametrize("rate", [None, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_a_breakdown_is_the_result_and_the_output_is_off_at_once(tell: Tell, rate: float | None) -> None:
     text = TEST + (f"rate_V_per_s = {rate}\n" if rate else "") + AFTER
     story = tell(replace=WEAK, protocol=text)

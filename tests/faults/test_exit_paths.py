@@ -152,7 +152,12 @@ class Ending:
         return None if outcome is None else str(outcome["status"])
 
 
-@pytest.mark.parametrize("how", ENDS)
+LIKE_OTHERS = {"two signals", "a limit", "old data", "a file", "an operating system's error"}  # their own codes: below
+
+
+@pytest.mark.parametrize(
+    "how", [pytest.param(how, marks=[pytest.mark.slow] if how in LIKE_OTHERS else []) for how in ENDS]
+)
 def test_not_safe_is_never_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     run = Ending(tmp_path, monkeypatch, ENDS[how][0], stuck=True)
     assert run.output > 780.0

@@ -108,7 +108,7 @@ def test_the_stage_stands_before_a_guard_that_hangs_is_waited_for(tell: Tell, mo
     assert abs(rest - begun[0]) < 0.5e-3  # at 2 mm/s
 
 
-@pytest.mark.parametrize("percent", [0.5, 20.0])
+@pytest.mark.parametrize("percent", [0.5, pytest.param(20.0, marks=pytest.mark.slow)])
 def test_an_output_found_live_is_taken_down_at_the_ramp_of_the_scene(tell: Tell, percent: float) -> None:
     live = f"[simulation.hv]\nstart_live_V = 500.0\nramp_percent_per_s = {percent}"
     story = tell(replace=("[simulation.hv]", live), take_down="--take-down")

@@ -59,7 +59,7 @@ def test_lines_doubled_torn_and_late_change_nothing(tell_other: Tell) -> None:
     assert max(targets) <= 1000.5 and len(targets) > 20
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_damaged_answers_never_raise_the_voltage(tell_other: Tell, seed: int) -> None:
     """There is no checksum: whatever a damaged digit says, it must not become a set-point."""
     targets: list[float] = []

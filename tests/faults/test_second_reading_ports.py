@@ -27,7 +27,7 @@ METERS = {
 }
 
 
-@pytest.fixture(scope="module", params=METERS)
+@pytest.fixture(scope="module", params=["scpi", pytest.param("ascii-stream", marks=pytest.mark.long)])
 def stand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
     with Stand(tmp_path_factory.mktemp("stand"), hold_s=20.0, more=METERS[request.param]) as stand:
         yield stand

@@ -128,6 +128,7 @@ def test_groups_20_percent_apart_are_told_apart_with_the_power_that_is_stated() 
     assert np.mean(false) <= 0.13  # 5 % expected of 40
 
 
+@pytest.mark.slow
 def test_area_scaling_finds_the_weakest_link_and_the_absence_of_any_influence() -> None:
     rng = np.random.default_rng(7)
     area = np.tile([0.1, 1.0, 10.0], 12)

@@ -133,6 +133,7 @@ def test_a_film_without_any_state_has_no_force_and_raises_nothing() -> None:
     assert found["mu"].shape == (5, 1)
 
 
+@pytest.mark.slow
 def test_an_elastic_fit_imports_nothing_of_branches() -> None:
     code = (
         "import sys, calibration.film.identify, calibration.film.summary, rig.analysis.film;"

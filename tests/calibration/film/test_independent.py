@@ -38,6 +38,7 @@ def test_errors_of_dimensions_and_gains_are_within_what_is_stated(tmp_path: Path
 
 
 @pytest.mark.slow
+@pytest.mark.long  # twenty: `test_coverage_of_the_stated_intervals`
 def test_coverage_in_thirty_experiments(tmp_path: Path) -> None:
     """The bounds are those of two hundred, widened by what chance does to thirty."""
     stated = LOOSE | {"force_gain": 0.005}
@@ -77,11 +78,11 @@ NAMED = [
         for name in (
             "drift of the force zero, linear",
             "friction in the guide of the disk",
-            "viscous film with a relaxation time near 30 s",
             "loss of voltage that grows with the voltage",
             "permittivity that falls with stretch",
         )
     ),
+    pytest.param("viscous film with a relaxation time near 30 s", marks=pytest.mark.long),
 ]
 
 
@@ -101,7 +102,13 @@ def test_an_imperfection_of_twice_the_size_that_shows_is_named(name: str, suspec
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("tau", "size"), [(1.0, 0.02), (30.0, 0.02), (300.0, 0.1)])
+@pytest.mark.parametrize(
+    ("tau", "size"),
+    [
+        (30.0, 0.02),
+        *(pytest.param(*case, marks=pytest.mark.long) for case in ((1.0, 0.02), (300.0, 0.1))),
+    ],
+)
 def test_the_size_of_a_viscous_suspect_is_that_of_the_films_branch(tau: float, size: float) -> None:
     """A branch of finite elements that share nothing with the model, and a load cell that tells its time."""
     name = f"viscous film with a relaxation time near {tau:g} s"

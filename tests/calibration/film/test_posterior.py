@@ -48,6 +48,7 @@ def test_what_the_fit_held_is_held(experiment):
         assert chains.quantities[name].deviation == pytest.approx(float(np.linalg.norm(fitted)), rel=0.3), name
 
 
+@pytest.mark.slow
 def test_emcee_is_imported_only_when_asked_for():
     code = "import sys, calibration.film.posterior, rig.analysis.film; sys.exit('emcee' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

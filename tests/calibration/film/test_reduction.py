@@ -103,6 +103,7 @@ def test_while_the_disk_is_held_the_mean_of_the_readings_is_its_place() -> None:
     assert np.isfinite(replace(curve, h=lost).place[6])
 
 
+@pytest.mark.slow
 def test_noise_of_the_displacement_of_a_held_film_is_no_misfit() -> None:
     """Reading a held disk with noise makes no film seem wrong: chi-square of the truth is its degrees of freedom."""
     places = (3e-3, 8e-3, 10e-3)

@@ -140,6 +140,7 @@ def test_stability_is_looked_at_over_the_strains_reached() -> None:
 # --- imperfections
 
 
+@pytest.mark.slow
 def test_wrinkled_samples_are_fitted_with_the_tension_field_and_counted(experiment: Experiment) -> None:
     curves = experiment(seed=4, samples=600, truth=ONE_TERM, guess=ONE_TERM, prestretch=1.0, highest=14e-3)
     out, kept = (identify(curves, terms=1, starts=1, wrinkling=way) for way in ("plain", "tension_field"))

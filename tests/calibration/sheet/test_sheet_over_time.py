@@ -67,6 +67,7 @@ def check(found: TimedFit, sheet: Sheet = SHEET) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
+@pytest.mark.long  # the whole command, below, finds the same
 def test_relaxation_and_cycles_give_law_and_branches() -> None:
     """Fitted to a uniaxial relaxation test and to one of two rates; what took no part is predicted."""
     tests = [made("uniaxial", relaxation(hold=100.0), 10.0, 3e-3, 1), made("uniaxial", cycles(count=1), 20.0, 3e-3, 2)]

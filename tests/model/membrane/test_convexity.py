@@ -39,7 +39,10 @@ def test_the_statuses_along_the_voltage_change_once() -> None:
     assert np.all(np.diff(found.force[found.answered]) < 0.0)
 
 
-@pytest.mark.parametrize("tolerance", [*(pytest.param(t, marks=pytest.mark.slow) for t in (1e-8, 1e-6)), 1e-4])
+@pytest.mark.parametrize(
+    "tolerance",
+    [*(pytest.param(t, marks=pytest.mark.long) for t in (1e-8, 1e-6)), pytest.param(1e-4, marks=pytest.mark.slow)],
+)
 def test_between_loss_of_convexity_and_slack_no_voltage_has_an_answer(tolerance: float) -> None:
     """At 1812.87 V the energy is convex at every point of a state that is there; the branch has ended before."""
     soft = Specimen(4e-3, 20e-3, 40e-6, 1.2, Material("soft", (8e4,), (2.5,), 2.5))
@@ -78,7 +81,11 @@ def test_a_taut_zone_about_to_vanish_leaves_no_hole() -> None:
 # High above the disk a stiffening film has solutions far out that no film at rest can reach.
 @pytest.mark.parametrize(
     ("mu", "alpha", "lp", "h"),
-    [((1e4,), (3.0,), 1.0, 0.4), ((3e4, 100.0), (1.3, 5.0), 1.0, 0.02), ((1e4,), (2.3,), 2.0, 0.4)],
+    [
+        pytest.param((1e4,), (3.0,), 1.0, 0.4, marks=pytest.mark.slow),
+        ((3e4, 100.0), (1.3, 5.0), 1.0, 0.02),
+        ((1e4,), (2.3,), 2.0, 0.4),
+    ],
 )
 def test_nothing_is_answered_beyond_the_end_of_the_branch(
     mu: tuple[float, ...], alpha: tuple[float, ...], lp: float, h: float

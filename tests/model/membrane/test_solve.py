@@ -314,6 +314,7 @@ def test_the_least_hoop_stress_inside_the_film_converges_with_the_tolerance() ->
     assert errors[2].max() < 1e-8
 
 
+@pytest.mark.slow
 def test_plain_equations_are_answered_beyond_slack_while_they_hold_tension_along_the_film() -> None:
     """Compression around, tension along: no film, but what the paper's equations say."""
     film = Specimen(4e-3, 20e-3, 40e-6, 1.0, NAMED["parker-cao2018"])

@@ -40,7 +40,7 @@ def test_forces_on_which_three_codes_agree(h: float, v: float, force: float, tol
     [
         (1.0, 12e-3, np.arange(1300.0, 2400.0, 200.0)),
         pytest.param(1.0, 4e-3, np.arange(700.0, 1250.0, 100.0), marks=pytest.mark.slow),
-        (1.2, 10e-3, np.arange(1700.0, 2650.0, 200.0)),
+        pytest.param(1.2, 10e-3, np.arange(1700.0, 2650.0, 200.0), marks=pytest.mark.slow),
     ],
 )
 def test_independent_formulation(lp: float, h: float, voltage: np.ndarray) -> None:

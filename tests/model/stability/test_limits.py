@@ -61,6 +61,7 @@ def test_breakdown_in_a_wrinkled_film() -> None:
     assert plain.voltage > 1.05 * limit.voltage  # the plain equations miss the folds' higher field
 
 
+@pytest.mark.slow
 def test_no_breakdown_before_the_film_hangs_slack() -> None:
     limit = breakdown_voltage(film(1.0), 4e-3)
     assert math.isnan(limit.voltage)
@@ -106,6 +107,7 @@ def test_pull_in_is_where_answers_end() -> None:
     assert np.isnan(above.force).all()
 
 
+@pytest.mark.slow
 def test_soft_film_that_loses_hoop_tension_has_no_natural_width() -> None:
     """With an exponent below 2 a fold would widen without bound: losing tension is the pull-in of the wrinkled film."""
     limit = pull_in_voltage(SOFT, 10e-3, wrinkling="tension_field")
@@ -113,6 +115,7 @@ def test_soft_film_that_loses_hoop_tension_has_no_natural_width() -> None:
     assert limit.voltage == pytest.approx(taut.voltage, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_no_pull_in_for_a_film_that_slackens_first() -> None:
     limit = pull_in_voltage(film(1.2), [4e-3, 10e-3], wrinkling="tension_field")
     assert np.isnan(limit.voltage).all()

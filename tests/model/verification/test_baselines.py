@@ -136,6 +136,7 @@ def test_collocation_converges_geometrically(coordinate: str, truth: Any) -> Non
     assert errors[2] < max(0.02 * errors[1], 2e-12)
 
 
+@pytest.mark.slow
 def test_a_hard_case_gives_a_reason_not_an_exception() -> None:
     specimen = Specimen(4e-3, 20e-3, 40e-6, 1.0, PARKER)
     for name in ("DOP853 shooting", "solve_bvp in ln R", "Chebyshev in ln R"):

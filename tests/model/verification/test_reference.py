@@ -107,7 +107,7 @@ def test_a_prestretched_film_begins_as_a_soap_film() -> None:
     np.testing.assert_allclose(reference(specimen, h).force, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("ratio", [1e-2, 1e-5])
+@pytest.mark.parametrize("ratio", [1e-2, pytest.param(1e-5, marks=pytest.mark.slow)])
 def test_a_disk_small_as_a_needle_still_balances(ratio: float) -> None:
     found = reference(Specimen(20e-3 * ratio, 20e-3, 40e-6, 1.2, parker()), 10e-3)
     assert found.converged.all()

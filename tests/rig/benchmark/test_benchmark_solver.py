@@ -44,6 +44,7 @@ def report() -> solver.Report:
     return found
 
 
+@pytest.mark.slow
 def test_every_method_has_a_point_for_every_tolerance(report: solver.Report) -> None:
     methods = {point.method for point in report.points}
     assert methods == {solver.OURS, solver.BATCH, "DOP853 shooting", "solve_bvp in ln R", "Chebyshev in ln R"}
@@ -55,12 +56,14 @@ def test_every_method_has_a_point_for_every_tolerance(report: solver.Report) -> 
         assert math.isfinite(point.hoop.median)
 
 
+@pytest.mark.slow
 def test_the_solver_keeps_to_its_tolerance_on_the_paper_s_states(report: solver.Report) -> None:
     for point in report.points:
         if point.method in (solver.OURS, solver.BATCH):
             assert point.force.largest <= point.tolerance
 
 
+@pytest.mark.slow
 def test_files_are_written_and_hold_the_same_numbers(report: solver.Report, tmp_path: Path) -> None:
     solver.save(report, tmp_path)
     saved = json.loads((tmp_path / "solver.json").read_text(encoding="utf-8"))
@@ -73,6 +76,7 @@ def test_files_are_written_and_hold_the_same_numbers(report: solver.Report, tmp_
         assert (tmp_path / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+@pytest.mark.slow
 def test_the_tables_name_methods_and_ratios(report: solver.Report) -> None:
     console = Console(width=160, record=True, file=io.StringIO())
     console.print(solver.render(report))
@@ -82,6 +86,7 @@ def test_the_tables_name_methods_and_ratios(report: solver.Report) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_curves_wrinkled_films_and_one_off_costs_are_measured_too() -> None:
     report = solver.measure(cases=3, methods=["DOP853 shooting"], batch=50, rounds=1)
     assert {speed.mode for speed in report.speeds} == {"cold single", "batch", "sweep"}

@@ -207,7 +207,7 @@ def test_a_folder_without_logs_has_everything_waiting(place: Path) -> None:
 @pytest.mark.parametrize(
     "times",
     [
-        pytest.param(3, marks=pytest.mark.slow),
+        pytest.param(3, marks=pytest.mark.long),  # one kill: `test_a_killed_one_is_taken_up_at_its_step_...`
         pytest.param(200, marks=[pytest.mark.long, pytest.mark.timeout(7200)]),
     ],
 )

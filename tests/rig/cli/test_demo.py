@@ -10,8 +10,10 @@ from click.testing import CliRunner, Result
 
 from calibration.film.identify import secant_modulus
 from model.material.materials import NAMED
+from rig.cli import demo as demo_module
 from rig.cli.app import main
 from rig.log.reader import read_log
+from rig.protocol import experiment
 from rig.protocol.experiment import prepare
 from rig.run.run import run
 
@@ -19,6 +21,13 @@ pytestmark = pytest.mark.slow  # the whole of it, two films
 
 LOGS = ("cone-4mm.mcap", "cone-6mm.mcap")
 TRUTH = NAMED["parker-cao2018"]  # what sim_fixtures/scenes/cone-*.toml hide in [simulation.film]
+
+
+def with_short_holds(scene: Path, protocol: Path) -> experiment.Experiment:
+    text = protocol.read_text(encoding="utf-8")
+    assert "hold_s = 40.0" in text
+    protocol.write_text(text.replace("hold_s = 40.0", "hold_s = 8.0"), encoding="utf-8")
+    return prepare(scene, protocol)
 
 
 @pytest.fixture(scope="module")
@@ -91,12 +100,19 @@ def test_an_existing_directory_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(600)
-def test_a_film_that_relaxes_is_found_with_its_branches(tmp_path: Path) -> None:
+@pytest.mark.parametrize("branches", [pytest.param(2, marks=pytest.mark.long), 1])
+def test_a_film_that_relaxes_is_found_with_its_branches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, branches: int
+) -> None:
+    """As it is; and with shorter holds and one branch, which takes a quarter of the time."""
     out = tmp_path / "viscous"
+    if branches == 1:
+        monkeypatch.setattr(demo_module, "BRANCHES", ((0.3, 2.0),))
+        monkeypatch.setattr(experiment, "prepare", with_short_holds)
     result = CliRunner().invoke(main, ["demo", "--viscous", "--out", str(out)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     found = json.loads((out / "fit.json").read_text())
-    assert len(found["spectrum"]["branches"]) == 2
+    assert len(found["spectrum"]["branches"]) == branches
     # Terms that the data do not determine are no more certain than that.
     known = {
         "eps_r": TRUTH.eps_r,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from rig.cli.app import main
+from rig.scene.presets import PRESETS
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = ("README.md", "rig/cli/README.md", "rig/design/README.md", "rig/benchmark/README.md")
@@ -56,3 +58,9 @@ def test_the_five_things_of_the_first_page_are_done(tmp_path: Path, monkeypatch:
         done = CliRunner().invoke(main, words)
         assert done.exit_code == 0, (words, done.output)
     assert {"mine", "run.mcap", "fit.json", "report.html", "run.csv"} <= {path.name for path in tmp_path.iterdir()}
+    assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    # The permittivity of the simulated film is found again.
+    init = wanted[0]
+    truth = PRESETS[init[init.index("--preset") + 1]].eps_r
+    found = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))["quantities"]["eps_r"]
+    assert abs(found["value"] - truth) < 4 * found["standard_uncertainty"] + 0.02 * truth

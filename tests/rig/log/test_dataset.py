@@ -186,6 +186,7 @@ def test_interpolate_edges():
     ]
 
 
+@pytest.mark.slow
 def test_many_short_curves_take_time_in_proportion(tmp_path):
     """Twice the samples in twice the curves take twice as long, give or take, not four times."""
     write_run(tmp_path / "a.mcap")

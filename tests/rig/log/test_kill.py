@@ -148,7 +148,7 @@ def kill(folder, victim, count, allowed_s):
 
 COUNTS = [
     pytest.param(10, id="some"),
-    pytest.param(60, id="more", marks=pytest.mark.slow),
+    pytest.param(30, id="more", marks=pytest.mark.slow),
     pytest.param(200, id="many", marks=pytest.mark.long),
 ]
 

@@ -93,7 +93,7 @@ def check_samples(log):
     assert (np.diff(samples["t_s"]) > 0).all()
 
 
-@pytest.mark.parametrize("run", [1, 2], indirect=True)
+@pytest.mark.parametrize("run", [1, pytest.param(2, marks=pytest.mark.long)], indirect=True)
 def test_kill_of_the_engine(run):
     engine, part = run
     writer = writer_of(part)

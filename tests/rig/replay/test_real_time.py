@@ -58,8 +58,10 @@ def recorded(name, folder):
         text = text.replace(f'driver = "{driver}"', f'driver = "{driver}"\ntimeout_s = 2.0')
     scene, log = folder / "scene.toml", folder / "run.mcap"
     scene.write_text(text)
+    protocol = folder / "protocol.toml"
+    protocol.write_text((fixture / "protocol.toml").read_text().replace("[0, 1000]", "[1000]"))  # one way up and down
     with served(scene, folder) as ports:
-        arguments = ("run", scene, fixture / "protocol.toml", "-o", log, "--ports", ports, "--arm", "--yes")
+        arguments = ("run", scene, protocol, "-o", log, "--ports", ports, "--arm", "--yes")
         run = dea_rig(*arguments)
         _, errors = run.communicate(timeout=200)
     assert log.exists(), errors

@@ -98,7 +98,15 @@ def test_without_arm_there_is_no_high_voltage_and_no_log(scene: Path, ports: Pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+# Those that a terminal sends are also in `tests/faults/test_terminal.py`.
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGTERM,
+        *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGINT, signal.SIGHUP)),
+        signal.SIGQUIT,
+    ],
+)
 def test_a_signal_ends_a_run_safely(
     scene: Path, live_soon: Path, ports: Path, tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -125,6 +125,7 @@ def test_it_runs_in_real_time(serve):
         assert took == pytest.approx(18 / 20 + 0.1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_host_that_does_not_read_costs_frames_not_the_server(serve):
     server = serve("stage", "force", force={"stored_rate_Hz": 2000.0})
     time.sleep(2.0)  # 4000 frames of 36 bytes: far more than a pseudo-terminal holds

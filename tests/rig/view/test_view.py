@@ -62,6 +62,7 @@ def rerun_binary() -> str:
     return str(Path(rerun_cli.__file__).with_name("rerun"))
 
 
+@pytest.mark.slow
 def test_a_saved_recording_holds_the_log(log, tmp_path):
     """Judged by Rerun's own checker and reader."""
     saved = tmp_path / "run.rrd"

@@ -137,6 +137,7 @@ def call(*arguments):
     return CliRunner().invoke(main, [str(one) for one in arguments])
 
 
+@pytest.mark.slow
 def test_from_a_scene_to_files_and_from_its_log_again(tmp_path, write_scene, steps):
     scene = write_scene(tmp_path, "seed = 3\n" + TRUTH["force"])
     (tmp_path / "steps.toml").write_text(steps["force"])
