@@ -159,6 +159,21 @@ def test_set_up_changes_no_output() -> None:
     assert not any(sample.flags for sample in rig.samples) and len(rig.samples) > 10
 
 
+@pytest.mark.parametrize("line", [0, 3])
+@pytest.mark.parametrize("high", [False, True], ids=["enabled low", "enabled high"])
+@pytest.mark.parametrize("level", [0, 1])
+def test_whether_it_is_enabled_is_the_level_of_its_own_line(line: int, high: bool, level: int) -> None:
+    """Either level, the other lines at the other one; read at set-up, and an output that is up is then live."""
+    rig = Rig(enable_line=line, enable_high=high)
+    rig.box.direction = 0xFF
+    rig.box.state = 1 << line if level else 0xFF & ~(1 << line)
+    rig.box.write(1000, f32(0.5), rig.clock.now())
+    rig.run(0.5)
+    enabled = bool(level) is high
+    assert rig.supply.settings["enabled_at_setup"] == ("yes" if enabled else "no")
+    assert (HVFlag.ON in rig.samples[-1].flags) is enabled
+
+
 def test_the_output_ramps_at_the_rate_and_is_measured() -> None:
     rig = Rig()
     rig.up(1000.0)
