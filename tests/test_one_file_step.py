@@ -145,6 +145,7 @@ def test_those_that_cannot_be_loaded_name_their_package_and_leave_other_protocol
     assert other.returncode == 0, other.stderr
 
 
+@pytest.mark.slow
 def test_a_name_of_the_programs_own_is_not_taken_over(other_package: Path) -> None:
     about = other_package / "knocking_for_rigs-1.0.dist-info" / "entry_points.txt"
     about.write_text("[dea_rig.steps]\nhome = knocking:Knock\n")

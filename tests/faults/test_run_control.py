@@ -192,7 +192,7 @@ def test_the_loop_goes_on_while_the_operator_is_waited_for(tell: Tell) -> None:
     assert story.end - lost[0] < 2.0 and story.outcome.safe
 
 
-@pytest.mark.parametrize("asked", [True, False])
+@pytest.mark.parametrize("asked", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_supply_found_live_is_taken_down_when_the_operator_chooses(tell: Tell, asked: bool) -> None:
     seen: list[str] = []
 

@@ -163,6 +163,7 @@ def test_pictures_show_what_was_fitted_with_the_tension_field(experiment: Experi
         assert shown == pytest.approx(told, rel=0.01)
 
 
+@pytest.mark.slow
 def test_it_is_the_same_each_time(tmp_path: Path, small: tuple[Identification, list[Curve]]) -> None:
     paths = [tmp_path / "one.html", tmp_path / "two.html"]
     for path in paths:

@@ -231,6 +231,7 @@ def test_nothing_is_planned_beyond_the_calibrated_range(tmp_path, write_scene):
     assert not list(tmp_path.glob("*.mcap*"))
 
 
+@pytest.mark.slow
 def test_the_compliance_of_the_rig_is_taken_off_where_the_stage_stands_for_the_disk(tmp_path, write_scene):
     """A rig that gives way makes the film look softer, unless its certificate says so.
 
