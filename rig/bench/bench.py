@@ -29,6 +29,10 @@ class SupplyProcess(Device, Protocol):
 
     link_settings: dict[str, str]
 
+    def fileno(self) -> int:
+        """Of the channel to that process."""
+        ...
+
     def attach(self, tap: Tap) -> None:
         """From now on bytes and frames are told to ``tap``."""
         ...
@@ -121,6 +125,17 @@ class Bench:
         """What a device has to say that the operator should know, since the last call."""
         device = self.devices[role]
         return cast(Remarking, device).remarks() if _makes_remarks(type(device)) else []
+
+    def has_link(self, role: str) -> bool:
+        """Whether the instrument is on a link of this process."""
+        return role in self._opened.links
+
+    def descriptor(self, role: str) -> int | None:
+        """By what the system says that something has come for ``role``; None where it has nothing of the kind."""
+        if not self.has_link(role):
+            return None if self._supply is None else self._supply.fileno()
+        descriptors = getattr(self._opened.links[role], "descriptors", ())
+        return descriptors[0] if descriptors else None
 
     def too_slow(self, role: str) -> str:
         """Why an instrument cannot give samples as often as the scene says, by its round trips so far; else nothing."""

@@ -2,8 +2,8 @@
 
 The simulated bench runs in a process of its own behind pseudo-terminals, with the force amplifier at 1 kHz, the stage
 polled at 50 Hz and the laser at 100 Hz. First only the three serial drivers are polled, in the engine's manner; then
-load cell, laser and a probe on one LabJack and a meter, over TCP, beside the stage; then a whole run with high voltage
-and log. POSIX only.
+load cell, laser and a probe on one LabJack and a meter, over TCP, beside the stage; then a whole run with high voltage,
+a meter and the log: loop, guard and log writer are three processes, and all three count. POSIX only.
 
 Lost samples are counted by their noise. What the simulated amplifier adds to its n-th frame follows from the scene's
 seed, so that every reading tells which frame it is, and no clock is needed to see that one is missing.
@@ -18,8 +18,8 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,6 +36,7 @@ from rig.base.clock import RealClock
 from rig.base.errors import RigError
 from rig.base.toml_file import validate
 from rig.bench.bench import Bench
+from rig.engine.attention import Attention
 from rig.engine.engine import LONGEST_TURN_S, SETUP_LIMIT_S, SHORTEST_TURN_S
 from rig.log.reader import read_log
 from rig.log.schema import ROLES
@@ -67,6 +68,15 @@ NETWORK_CHANGES = {
     "[simulation]\n": '[monitor]\ndriver = "labjack-monitor"\nquantity = "temperature"\nrate_Hz = 10.0\n'
     'timeout_s = 2.0\n\n[monitor_2]\ndriver = "scpi"\nquantity = "humidity"\nrate_Hz = 5.0\n\n[simulation]\n',
 }
+
+METER = {
+    "[simulation]\n": '[monitor]\ndriver = "scpi"\nquantity = "temperature"\nrate_Hz = 10.0\ntimeout_s = 2.0\n\n'
+    "[simulation]\n"
+}
+LAST_HOLD = 'do = "hold"\nduration_s = 0.5'  # of the short protocol, where the full measurement stays
+LONG_HOLD = 'do = "voltage"\nvoltage_V = 800\n\n[[step]]\ndo = "hold"\nduration_s = {seconds:g}\n\n'
+LONG_HOLD += '[[step]]\ndo = "voltage"\nvoltage_V = 0'
+PROCESSES = {"rig.safety.process": "guard", "rig.log.server": "log"}
 
 # From the scene of the examples to this one. Short ways; and time-outs with patience, they are not what is measured.
 CHANGES = {
@@ -116,6 +126,7 @@ class Row:
     host_share: float
     simulator_share: float
     polled: list[Polled]
+    shares: dict[str, float] = field(default_factory=dict)  # of the host's, by process
 
     @property
     def used_of_allowed(self) -> float:
@@ -133,7 +144,7 @@ class Report:
 
 
 def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None) -> Report:
-    """Poll for 10 s (full: 60 s), then a whole run of half a minute; write ``rates.json`` and ``rates.png``."""
+    """Poll for 10 s, then a whole run of half a minute (full: 60 s more, each); ``rates.json`` and ``rates.png``."""
     report = measure(60.0 if full else 10.0, full=full, progress=progress)
     save(report, out_dir)
     return report
@@ -161,7 +172,8 @@ def measure(
         if network:
             rows.append(_network(on_tcp, seconds, lambda done: progress(first + (share - first) * done, NETWORK)))
         if whole_run:
-            rows.append(_whole_run(path, folder, lambda done: progress(share + RUN_SHARE * done, WHOLE_RUN)))
+            hold_s = seconds if full else 0.0
+            rows.append(_whole_run(folder, hold_s, lambda done: progress(share + RUN_SHARE * done, WHOLE_RUN)))
     environment = {
         "python": platform.python_version(),
         "system": platform.system(),
@@ -225,9 +237,10 @@ def _poll(path: Path, seconds: float, rates: Mapping[str, float], progress: Call
     with _simulator(path) as (simulator, ports), closing(open_bench(_without_hv(scene).with_ports(ports))) as bench:
         clock, devices = bench.clock, bench.devices
         bench.attach(lambda role, way, data, t: None)
+        attention = Attention(bench)
         give_up = clock.now() + SETUP_LIMIT_S
         while not all(device.ready for device in devices.values()):
-            _turn(bench)
+            _turn(bench, attention)
             if clock.now() > give_up:
                 raise RigError(f"The simulated bench was not set up within {SETUP_LIMIT_S:.0f} s.")
         before = {role: dict(device.counters) for role, device in devices.items()}
@@ -236,7 +249,7 @@ def _poll(path: Path, seconds: float, rates: Mapping[str, float], progress: Call
         begun, used, used_there = clock.now(), process_time(), _processor_time(simulator)
         next_progress = begun
         while clock.now() < begun + seconds:
-            for role, sample in _turn(bench):
+            for role, sample in _turn(bench, attention):
                 counts[role] = counts.get(role, 0) + 1
                 if isinstance(sample, ForceSample):
                     readings.append(sample.reading)
@@ -286,12 +299,16 @@ def _network(path: Path, seconds: float, progress: Callable[[float], None]) -> R
     )
 
 
-def _turn(bench: Bench) -> list[tuple[str, Sample]]:
+def _turn(bench: Bench, attention: Attention) -> list[tuple[str, Sample]]:
     """One turn as `rig.engine.engine.Engine` makes it, without what it does with the samples."""
-    now = bench.clock.now()
-    samples = [(role, sample) for role, device in bench.devices.items() for sample in device.poll(now)]
-    wanted = min(device.next_poll for device in bench.devices.values())
-    bench.clock.sleep_until(min(max(wanted, now + SHORTEST_TURN_S), now + LONGEST_TURN_S))
+    began = bench.clock.now()
+    samples: list[tuple[str, Sample]] = []
+    for role in attention.wanted(began):
+        now = bench.clock.now()
+        attention.polled(role, now)
+        samples += [(role, sample) for sample in bench.poll(role, now)]
+    due, awaited = attention.next()
+    attention.wait(began + SHORTEST_TURN_S, min(max(due, began + SHORTEST_TURN_S), began + LONGEST_TURN_S), awaited)
     return samples
 
 
@@ -303,21 +320,27 @@ def _polled(role: str, wanted: float, reached: float, device: Device, before: di
     return Polled(role, wanted, reached, 1e-3 * mean, 1e-3 * longest, new["retries"], new["polls_missed"])
 
 
-def _whole_run(path: Path, folder: Path, progress: Callable[[float], None]) -> Row:
+def _whole_run(folder: Path, hold_s: float, progress: Callable[[float], None]) -> Row:
+    """The short protocol with all links and high voltage; of it the last ``hold_s`` or, if that is 0, the whole."""
+    path, protocol, log_path = folder / "whole.toml", folder / "protocol.toml", folder / "run.mcap"
+    path.write_text(scene_text(changes=CHANGES | METER), encoding="utf-8")
     scene, _ = load_scene(path)
-    protocol = Path(str(files("sim_fixtures"))) / "protocols" / "short.toml"
-    log_path = folder / "run.mcap"
+    short = (Path(str(files("sim_fixtures"))) / "protocols" / "short.toml").read_text(encoding="utf-8")
+    protocol.write_text(short.replace(LAST_HOLD, LONG_HOLD.format(seconds=hold_s)) if hold_s else short, "utf-8")
     clock = RealClock()
     with _simulator(path) as (simulator, ports):
-        marks: list[tuple[float, float, float]] = []  # time, processor time here and there
+        marks: list[tuple[float, dict[str, float], float]] = []  # time, processor time here and there
 
-        def note(done: float, total: float, _: str) -> None:
-            marks.append((clock.now(), process_time(), _processor_time(simulator)))
+        def note(done: float, total: float, label: str) -> None:
+            if " hold: " in label or not hold_s:
+                marks.append((clock.now(), _processor_times(), _processor_time(simulator)))
             progress(done / total)
 
         consent = Consent(arm="a benchmark", answers="a benchmark")
         run_experiment(prepare(path, protocol, ports), log_path, note, consent)
-    elapsed, host, there = np.subtract(marks[-1], marks[0])
+    (begun, before, there_before), (ended, after, there_after) = marks[0], marks[-1]
+    elapsed = ended - begun
+    shares = {who: (after[who] - before[who]) / elapsed for who in after if who in before}
     log = read_log(log_path)
     tables = log.tables(["/force/sample", "/stage/sample", "/displacement/sample"])
     t = tables["/force/sample"]["t_s"]
@@ -328,15 +351,29 @@ def _whole_run(path: Path, folder: Path, progress: Callable[[float], None]) -> R
     lasted = float(t[-1] - t[0])
     return Row(
         WHOLE_RUN,
-        float(elapsed),
+        elapsed,
         FORCE_HZ * lasted + 1,
         len(readings),
         count_lost(readings, sent_readings(scene, lasted + SETUP_LIMIT_S), _noise(scene)),
         int(gaps[gaps > 0].sum()) + sum(log.missing.get(f"/{role}/sample", 0) for role in ROLES),
-        float(host / elapsed),
-        float(there / elapsed),
+        sum(shares.values()),
+        (there_after - there_before) / elapsed,
         [Polled(role, rates[role], reached[role], math.nan, math.nan, 0, 0) for role in rates],
+        shares,
     )
+
+
+def _processor_times() -> dict[str, float]:
+    """Seconds of processor time of each process of a run; of the loop's own only where there is no ``/proc``."""
+    times = {"loop": process_time()}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            words = (folder / "cmdline").read_bytes().decode(errors="replace")
+            parent = (folder / "stat").read_text().rpartition(")")[2].split()[1]
+            who = next((who for name, who in PROCESSES.items() if name in words), "")
+            if who and int(parent) == os.getpid():
+                times[who] = _processor_time(int(folder.name))
+    return times
 
 
 @contextmanager
@@ -492,7 +529,12 @@ def render(report: Report) -> RenderableType:
                 *(str(number) if measured else "" for number in (p.retries, p.missed)),
             )
     setting = ", ".join(f"{name} {value}" for name, value in report.environment.items())
-    return Group(force, polled, f"Measured on: {setting}.")
+    processes = [
+        f"{row.what}: {', '.join(f'{who} {share:.1%}' for who, share in row.shares.items())} of a core."
+        for row in report.rows
+        if row.shares
+    ]
+    return Group(force, polled, *processes, f"Measured on: {setting}.")
 
 
 def _draw(report: Report, path: Path) -> None:

@@ -20,6 +20,7 @@ from drivers.roles import HVSample, MonitorSample, Sample
 from rig.base.errors import ConfigError, FaultError, LimitError, RigError, StaleData, Stopped
 from rig.base.host import HostTime
 from rig.bench.bench import Bench
+from rig.engine.attention import Attention
 from rig.engine.lent import Kept, Lent, wait_given_back
 from rig.engine.look import Outlook
 from rig.engine.outcome import NOT_SAFE_STATUS, Outcome
@@ -53,6 +54,11 @@ SHOWN_EVERY_S = 2.0  # how often those are named that have not answered yet
 SNAPSHOT_S = 1.0  # before and after what ended a run under voltage: the log holds every sample of it, and says where
 ROUNDING_S = 1e-6  # of clock times: whether a turn is the last one must not hang on the last digit
 OUTPUT_LIMIT_S = 3.0  # how long a supply may take after set-up to be measured off
+
+
+def _within_bounds(now: float, wanted: float) -> float:
+    """When the turn after that of ``now`` begins, for devices that wish it at ``wanted``."""
+    return min(max(now + SHORTEST_TURN_S, wanted), now + LONGEST_TURN_S)  # in this order NaN is no time
 
 
 def _lets_ramp_down(error: Exception) -> bool:
@@ -245,6 +251,7 @@ class Engine:
             What does not fit, or does not answer.
         """
         self.bench.attach(self.recorder.wire)
+        self._attention = Attention(self.bench)
         self._appoint_guard()
         devices = self.bench.devices
         began, told = self.clock.now(), 0.0
@@ -452,9 +459,11 @@ class Engine:
         self.control.poll(began)
         if self.control.count:
             raise Stopped(f"stopped by {self.control.source}")
-        for role in self.bench.devices:
+        attention = self._attention
+        for role in attention.wanted(began):
             # Each device its own time: data must never seem to have come before they were sent.
             now = self.clock.now()
+            attention.polled(role, now)
             for sample in self._poll(role, now):
                 self._take(role, sample, now)
             for remark in self.bench.remarks(role):
@@ -467,7 +476,8 @@ class Engine:
             self._watch.turn(now)
             self._beat(self._watch, now)
         self.recorder.tick(now)
-        self.clock.sleep_until(self._next_turn(began))
+        due, awaited = attention.next()
+        attention.wait(began + SHORTEST_TURN_S, _within_bounds(began, due), awaited)
 
     def _poll(self, role: str, now: float) -> Sequence[Sample]:
         """New samples. An instrument that only says what air it is ends no run, once it has begun."""
@@ -494,8 +504,7 @@ class Engine:
         guard.turn(now)
 
     def _next_turn(self, now: float) -> float:
-        wanted = min(device.next_poll for device in self.bench.devices.values())
-        return min(max(now + SHORTEST_TURN_S, wanted), now + LONGEST_TURN_S)  # in this order NaN is no time
+        return _within_bounds(now, min(device.next_poll for device in self.bench.devices.values()))
 
     def _take(self, role: str, sample: Sample, now: float) -> None:
         sample = self.recorder.add(sample)

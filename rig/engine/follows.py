@@ -17,7 +17,7 @@ import numpy as np
 
 from model.membrane.solve import solve, solve_many
 from rig.base.errors import FaultError
-from rig.safety.limits import FLAT_M, Limits
+from rig.safety.limits import FLAT_M, Limits, Line
 from rig.scene.scene import Scene
 
 ERRORS = 4.0  # standard errors of the slope that 1/k must be away from 0
@@ -38,6 +38,7 @@ class ForceFollows:
         force = solve_many(self._specimen, h, 0.0).force
         known = np.isfinite(force)
         self._h, self._model = h[known], force[known]
+        self._line = Line(self._h, self._model) if self._h.size > 1 else None
         self._stiffer = self._at_once()
         self._volts = 0.0
         self.restart()
@@ -69,12 +70,12 @@ class ForceFollows:
         FaultError
             The force has not followed the film.
         """
-        if not (math.isfinite(force) and math.isfinite(h) and math.isfinite(volts)) or self._h.size < 2:
+        if self._line is None or not (math.isfinite(force) and math.isfinite(h) and math.isfinite(volts)):
             return
         if abs(volts - self._volts) > max(SAME_V, SAME_PART * self._volts):
             self.restart()
             self._volts = volts
-        model = float(np.interp(h, self._h, self._model))
+        model = self._line(h)
         self._count += 1
         away = model - self._mean_m
         self._mean_m += away / self._count

@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Sequence
 from itertools import pairwise
 
-from drivers.roles import DisplacementSample, ForceSample, HVFlag, HVSample, MonitorSample, Sample, StageSample
+from drivers.roles import OK, DisplacementSample, ForceSample, HVFlag, HVSample, MonitorSample, Sample, StageSample
 from rig.base.errors import FaultError, StaleData
 from rig.bench.bench import Bench
 from rig.engine.follows import ForceFollows
@@ -43,6 +43,7 @@ class Watch:
     def __init__(self, bench: Bench, recorder: Recorder, limits: Limits, guard: AnyGuard | None) -> None:
         self._recorder = recorder
         self._limits = limits
+        self._from_stored_zero = limits.force.widened(1.0 if recorder.has_stored_zero else 1 + ZERO_PART)
         self._guard = guard
         self._silence = allowed_silence(bench)
         self._newest = dict.fromkeys(bench.devices, bench.clock.now())
@@ -62,14 +63,14 @@ class Watch:
     def sample(self, role: str, sample: Sample, now: float) -> None:
         """Judge one sample, as the recorder gave it back."""
         self._newest[role] = now
-        match sample:
-            case StageSample():
-                self._judge_stuck(sample)
+        match sample:  # the most frequent first
             case ForceSample():
                 if self._good(role, sample):
                     self._judge_frozen(role, sample.reading)
                     self._judge_force(sample)
                     self._judge_following(sample)
+            case StageSample():
+                self._judge_stuck(sample)
             case DisplacementSample():
                 if self._good(role, sample):
                     self._judge_frozen(role, sample.displacement)
@@ -79,7 +80,7 @@ class Watch:
                 self._judge_output(sample)
             case MonitorSample() if role in self._silence:
                 self._good(role, sample)
-        if isinstance(sample, StageSample) or not sample.flags:
+        if isinstance(sample, StageSample) or sample.flags == OK or not sample.flags:
             self.newest_good[role] = now
 
     def turn(self, now: float) -> None:
@@ -104,10 +105,13 @@ class Watch:
 
     def _good(self, role: str, sample: ForceSample | DisplacementSample | MonitorSample) -> bool:
         """A sensor may call single samples bad, but not several in a row: then nobody knows where the film is."""
-        self._bad[role] = self._bad[role] + 1 if sample.flags else 0
+        if sample.flags == OK:  # nearly always
+            self._bad[role] = 0
+            return True
+        self._bad[role] += 1
         if self._bad[role] >= BAD_SAMPLES:
             raise StaleData(f"{role}: {BAD_SAMPLES} samples in a row are bad ({flag_names(sample.flags)}).")
-        return not sample.flags
+        return False
 
     def learn(self, role: str, readings: Sequence[float]) -> None:
         """Learn from readings of the unloaded sensor how many equal ones in a row its noise can give."""
@@ -134,11 +138,11 @@ class Watch:
             raise StaleData(f"stage: it says that it moves, but its position has not changed for {still:.2f} s.")
 
     def _judge_force(self, sample: ForceSample) -> None:
-        recorder, limit = self._recorder, self._limits.force
+        recorder = self._recorder
         if math.isfinite(recorder.force_zero):
-            limit.check(recorder.quantity_of(sample), "Force measured")
-        allowed = limit if recorder.has_stored_zero else limit.widened(1 + ZERO_PART)
-        allowed.check(recorder.from_stored_zero(sample.reading), "Force measured, against the stored zero")
+            self._limits.force.check(recorder.quantity_of(sample), "Force measured")
+        reading = recorder.from_stored_zero(sample.reading)
+        self._from_stored_zero.check(reading, "Force measured, against the stored zero")
 
     def _judge_following(self, sample: ForceSample) -> None:
         """In contact with the film only; the samples of a zero step are not."""

@@ -27,9 +27,8 @@ class Checks:
         """The bytes of a message; every field must be there and of its type."""
         if topic not in schema.CHANNELS:
             raise LogError(self._path, f"there is no topic {topic!r}", f"Topics: {', '.join(schema.CHANNELS)}.")
-        for name, ns in (("log_ns", log_ns), ("publish_ns", publish_ns)):
-            if type(ns) is not int or not 0 <= ns <= _MAX_NS:
-                raise LogError(self._path, f"{name} is {ns!r} on {topic}", "It must be nanoseconds since 1970, an int.")
+        if not (type(log_ns) is type(publish_ns) is int and 0 <= log_ns <= _MAX_NS and 0 <= publish_ns <= _MAX_NS):
+            self._wrong_time(topic, log_ns, publish_ns)
         try:
             data = schema.encode(topic, fields)
         except ValueError as error:
@@ -39,6 +38,11 @@ class Checks:
                 self._path, f"a message of {len(data)} bytes on {topic}", f"At most {_MAX_MESSAGE} are allowed."
             )
         return data
+
+    def _wrong_time(self, topic: str, log_ns: int, publish_ns: int) -> None:
+        for name, ns in (("log_ns", log_ns), ("publish_ns", publish_ns)):
+            if type(ns) is not int or not 0 <= ns <= _MAX_NS:
+                raise LogError(self._path, f"{name} is {ns!r} on {topic}", "It must be nanoseconds since 1970, an int.")
 
     def attachment(self, name: str, data: bytes) -> None:
         """A file; each name once."""

@@ -1,7 +1,7 @@
 """What a producer and the process that writes the log say to each other over a stream socket.
 
 A frame is CRC-32 of the rest (4 bytes, little-endian), length of the body (4), kind (1), body. Bodies are plain bytes
-or JSON; nothing in them can run.
+or JSON; nothing in them can run. The messages of a turn travel in one frame.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ _HEAD = struct.Struct("<IIB")
 MOST = 48 * 1024 * 1024  # of a body; the largest is an attachment
 
 # From a producer:
-MESSAGE, ATTACHMENT, METADATA, FINISH = range(1, 5)
+MESSAGES, ATTACHMENT, METADATA, FINISH = range(1, 5)
 # From the writer:
 READY, ALIVE, DONE, FAILED = range(5, 9)
 
-MESSAGE_HEAD = struct.Struct("<BQQ")  # index of the topic in rig.log.schema.CHANNELS, log time, publish time
+# Before each message in MESSAGES: index of the topic in rig.log.schema.CHANNELS, log time, publish time, length.
+MESSAGE_HEAD = struct.Struct("<BQQI")
 # In ALIVE: bytes free on the disk (-1: not known), and for how long the writer has been busy with one turn (s).
 STATE = struct.Struct("<qd")
 

@@ -80,6 +80,7 @@ class LogProcess(RemoteLog):
         """Put a table of strings into the log."""
         self._check()
         self._checks.metadata(name, mapping)
+        self._end_frame()
         self._waiting += frames.pack(frames.METADATA, json.dumps([name, dict(mapping)]).encode())
         self._send()
 
@@ -87,6 +88,7 @@ class LogProcess(RemoteLog):
         """Put a file into the log. Waits until the writer has it: not for use while the rig is driven."""
         self._check()
         self._checks.attachment(name, data)
+        self._end_frame()
         self._waiting += frames.pack(frames.ATTACHMENT, json.dumps([name, media_type]).encode() + b"\n" + data)
         self._drain()
 
@@ -98,6 +100,7 @@ class LogProcess(RemoteLog):
         self._check()
         self._checks.metadata("outcome", outcome)
         self.second.close()
+        self._end_frame()
         self._waiting += frames.pack(frames.FINISH, json.dumps(dict(outcome)).encode())
         self._drain()
         self._wait_for(frames.DONE, FINISH_S)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from drivers.roles import DisplacementSample, ForceSample, HVSample, Identity, MonitorSample, Sample, StageSample
+from drivers.roles import OK, DisplacementSample, ForceSample, HVSample, Identity, MonitorSample, Sample, StageSample
 from rig.base.clock import Clock
 from rig.base.errors import FaultError
 from rig.log import space
@@ -102,7 +102,7 @@ class Recorder:
             sample = replace(sample, voltage=sample.voltage * self._gains.voltage)
         elif isinstance(sample, MonitorSample) and sample.quantity == "voltage":
             sample = replace(sample, value=sample.value * self._gains.second)
-        match sample:
+        match sample:  # the most frequent first
             case ForceSample():
                 self.force_sample = sample
                 self._write(
@@ -110,7 +110,7 @@ class Recorder:
                     sample.t,
                     reading=sample.reading,
                     force_N=self.quantity_of(sample),
-                    flags=sample.flags.value,
+                    flags=0 if sample.flags == OK else sample.flags.value,
                 )
             case StageSample():
                 self.stage = sample
@@ -287,10 +287,11 @@ class Recorder:
         """The first error of the log ends the run; after it the way to the safe state goes on unrecorded."""
         if self.log_failed:
             return
-        epoch_ns = self._clock.epoch_ns
-        about_ns = epoch_ns(t if about is None else about)
+        clock = self._clock
+        about_ns = clock.epoch_ns(t if about is None else about)
+        fields["t_s"] = t
         try:
-            self._log.write(topic, {"t_s": t, **fields}, epoch_ns(self._clock.now()), about_ns)
+            self._log.write(topic, fields, clock.epoch_ns(clock.now()), about_ns)
         except LogError as error:
             self._lost(error)
 

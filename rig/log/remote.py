@@ -19,6 +19,7 @@ multiprocessing's "spawn": one that is forked holds the engine's own end open, a
 from __future__ import annotations
 
 import json
+import math
 import select
 import socket
 from collections.abc import Mapping
@@ -33,6 +34,8 @@ from rig.log.errors import LogError
 
 MOST_WAITING = 8 * 1024 * 1024  # bytes not yet taken by the writer: half a minute of a run with all sensors at 1 kHz
 SILENCE_S = 0.8  # the writer says ten times a second that it lives, by a thread of its own ...
+MOST_IN_FRAME = 32 * 1024  # bytes of messages: so much a torn frame may take along
+LISTEN_S = 0.02  # how often we listen
 LATE_S = 0.05  # a turn of ours that took longer is not the writer's silence
 BUSY_S = 5.0  # ... and for how long it has waited for its disk, which may keep it that long
 BLOCKING_S = 10.0  # for what may block: an attachment before the run, closing
@@ -66,11 +69,13 @@ class RemoteLog:
         self._end = end
         self._end.setblocking(False)
         self._checks = Checks(path)
-        self._waiting = bytearray()
+        self._waiting = bytearray()  # frames
+        self._messages = bytearray()  # of the frame that is being made
         self._unpack = frames.Unpacker()
         self._failure: LogError | None = None
         self._last_heard: float | None = None
         self._last_tick: float | None = None
+        self._next_listen = -math.inf
         self._busy = 0.0  # for how long the writer has waited for its disk (s)
         self._heard: set[int] = set()  # kinds of frames since last looked
 
@@ -80,12 +85,14 @@ class RemoteLog:
         Commands and bytes for a wire are sent at once, so that they are in the log before they can take effect;
         everything else with the next `tick`.
         """
-        self._check()
+        if self._failure is not None:
+            self._check()
         data = self._checks.message(topic, fields, log_ns, publish_ns)
-        head = frames.MESSAGE_HEAD.pack(_TOPICS[topic], log_ns, publish_ns)
-        self._waiting += frames.pack(frames.MESSAGE, head + data)
+        self._messages += frames.MESSAGE_HEAD.pack(_TOPICS[topic], log_ns, publish_ns, len(data)) + data
         if topic in _AHEAD:
             self._send()
+        elif len(self._messages) > MOST_IN_FRAME:
+            self._end_frame()
         if len(self._waiting) > MOST_WAITING:
             raise self._fail("the process that writes the log does not keep up", "Use a faster disk.")
 
@@ -96,7 +103,9 @@ class RemoteLog:
         """
         self._check()
         self._send()
-        self._listen()
+        if now >= self._next_listen:
+            self._next_listen = now + LISTEN_S
+            self._listen()
         late = now - self._last_tick - LATE_S if self._last_tick is not None else 0.0
         self._last_tick = now
         if self._heard or self._last_heard is None:
@@ -128,7 +137,13 @@ class RemoteLog:
         self._failure = LogError(self.path, what, advice)
         return self._failure
 
+    def _end_frame(self) -> None:
+        if self._messages:
+            self._waiting += frames.pack(frames.MESSAGES, bytes(self._messages))
+            self._messages.clear()
+
     def _send(self) -> None:
+        self._end_frame()
         try:
             while self._waiting:
                 del self._waiting[: self._end.send(self._waiting)]

@@ -23,7 +23,7 @@ from rig.log import frames, schema
 from rig.log.errors import LogError
 from rig.log.writer import LogWriter
 
-LONGEST_TURN_S, SHORTEST_TURN_S = 0.02, 0.01
+LONGEST_TURN_S, SHORTEST_TURN_S = 0.02, 0.02
 ALIVE_S = 0.1
 OTHERS_S = 5.0  # how long a finished engine waits for the others to end
 MOST_AT_ONCE = 1024 * 1024
@@ -148,9 +148,12 @@ def _record(log: LogWriter, producers: Sequence[Producer], alive: Alive) -> bool
 
 def _take(log: LogWriter, kind: int, body: bytes) -> None:
     match kind:
-        case frames.MESSAGE:
-            topic, log_ns, publish_ns = frames.MESSAGE_HEAD.unpack_from(body)
-            log.add(_TOPICS[topic], body[frames.MESSAGE_HEAD.size :], log_ns, publish_ns)
+        case frames.MESSAGES:
+            at, before = 0, frames.MESSAGE_HEAD
+            while at < len(body):
+                topic, log_ns, publish_ns, length = before.unpack_from(body, at)
+                at += before.size + length
+                log.add(_TOPICS[topic], body[at - length : at], log_ns, publish_ns)
         case frames.METADATA:
             name, table = json.loads(body)
             log.metadata(name, table)

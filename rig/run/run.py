@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import platform
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, closing, nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -120,7 +121,8 @@ def run(
             )
             if awake:
                 engine.recorder.event("info", "host", awake)
-            outcome, error = engine.run()
+            with _undisturbed(experiment.scene):
+                outcome, error = engine.run()
             bench.close()  # before the log ends: closing a device may say a last word on its wire
             if not engine.recorder.log_failed:
                 log.finish(outcome.as_text())
@@ -140,6 +142,22 @@ def run(
     finally:
         bench.close()
     return outcome
+
+
+@contextmanager
+def _undisturbed(scene: Scene) -> Iterator[None]:
+    """On real ports: what was made before the run is left out of Python's search for garbage.
+
+    A search through all of it holds the loop up for longer than the guard allows.
+    """
+    if not scene.on_real_ports:
+        yield
+        return
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def worst(outcome: Outcome, error: Exception | None) -> Exception:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -193,6 +194,29 @@ class FilmLimits:
             self.check(h, voltage, f"Move to {h1 * 1e3:.2f} mm with {voltage:g} V on, at {h * 1e3:.2f} mm")
 
 
+class Line:
+    """Straight lines between points, as `numpy.interp` draws them, for one place at a time: ten times as fast.
+
+    Parameters
+    ----------
+    x, y
+        Finite, one at least; ``x`` rises. Beyond the ends the value at the end goes on.
+    """
+
+    def __init__(self, x: Floats, y: Floats) -> None:
+        self._x: list[float] = x.tolist()
+        self._y: list[float] = y.tolist()
+        self._slopes: list[float] = (np.diff(y) / np.diff(x)).tolist()
+
+    def __call__(self, x: float) -> float:
+        k = bisect_right(self._x, x) - 1
+        if k < 0:
+            return self._y[0]
+        if k >= len(self._slopes):
+            return self._y[-1]
+        return self._slopes[k] * (x - self._x[k]) + self._y[k]
+
+
 class StretchLimit:
     """The film's largest stretch (``max_stretch`` of its material) without voltage, by the model, at any displacement.
 
@@ -201,13 +225,13 @@ class StretchLimit:
 
     def __init__(self, specimen: Specimen, limits: Limits) -> None:
         self._limit = limits.stretch
-        self._h: Floats = np.empty(0)
-        self._stretch: Floats = np.empty(0)
+        self._stretch: Line | None = None
         if math.isfinite(self._limit.high):
             h = np.linspace(FLAT_M, max(limits.displacement.high, 2 * FLAT_M), STRETCH_POINTS)
             stretch = solve_many(specimen, h, 0.0).max_stretch
             known = np.isfinite(stretch)
-            self._h, self._stretch = h[known], stretch[known]
+            if known.sum() > 1:
+                self._stretch = Line(h[known], stretch[known])
 
     def check(self, h: float, where: str) -> None:
         """Raise unless the film is stretched less with the disk at ``h`` metres; what is not known is not held.
@@ -216,5 +240,5 @@ class StretchLimit:
         ------
         LimitError
         """
-        if self._h.size > 1 and math.isfinite(h):
-            self._limit.check(float(np.interp(h, self._h, self._stretch)), where)
+        if self._stretch is not None and math.isfinite(h):
+            self._limit.check(self._stretch(h), where)

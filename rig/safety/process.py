@@ -14,6 +14,7 @@ belongs to the hardware, to interlock loop, emergency stop and bleed resistor.
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
@@ -28,6 +29,7 @@ from pathlib import Path
 
 import click
 
+from drivers.dialogue import LOOK_AGAIN_S
 from drivers.links.link import DeviceError, DeviceLost
 from drivers.roles import GivesBack, HVSample, HVSupply, MonitorSample, SampleFlag
 from drivers.settings import SupplySettings
@@ -104,7 +106,7 @@ def serve(end: socket.socket) -> None:
         channel.send({"is": "error", "error": pack_error(error)})
         return
     clock = RealClock(known["zero"], known["ns"])
-    server = Server(scene, scene.hv, link, channel, clock, Peer(int(begin["engine"])))
+    server = Server(scene, scene.hv, link, channel, clock, Peer(int(begin["engine"])), adopted[0] if adopted else None)
     try:
         server.run()
     finally:
@@ -137,7 +139,14 @@ class Server:
     """Runs the guard's loop until the engine closes the channel and the output has been taken care of."""
 
     def __init__(
-        self, scene: Scene, table: SupplySettings, link: Link, channel: Channel, clock: RealClock, engine: Peer
+        self,
+        scene: Scene,
+        table: SupplySettings,
+        link: Link,
+        channel: Channel,
+        clock: RealClock,
+        engine: Peer,
+        descriptor: int | None = None,
     ) -> None:
         self._scene = scene
         self._table = table
@@ -145,6 +154,8 @@ class Server:
         self._channel = channel
         self._clock = clock
         self._engine = engine
+        self._descriptor = descriptor  # of the link: by it the system says that something has come
+        self._came = True  # whether it has said so
         self._host = HostTime(clock)
         self._supply: HVSupply | None = None
         self._guard: Guard | None = None
@@ -194,7 +205,9 @@ class Server:
         guard, supply = self._guard, self._supply
         if guard is None or supply is None:
             return
-        self._poll(guard, supply)
+        asked = any(message.get("do") != "heartbeat" for message in messages)
+        if asked or self._came or self._clock.now() >= self._due(guard, supply):
+            self._poll(guard, supply)
         now = self._clock.now()
         guard.turn(now)
         self._host.check()
@@ -204,6 +217,19 @@ class Server:
         elif now >= self._next_alive:
             self._channel.send({"is": "alive"})
             self._next_alive = now + ALIVE_S
+
+    def _awaits(self, guard: Guard, supply: HVSupply) -> bool:
+        """Whether an answer is all that is waited for, by what `Dialogue.next_poll` says then, and the link tells it.
+
+        Never while an output that was commanded off is not measured off: then nothing is left to the link.
+        """
+        goes_off = guard.commanded and guard.state is GuardState.SAFE and not guard.output_is_safe
+        return self._descriptor is not None and not goes_off and supply.next_poll == self._polled_at + LOOK_AGAIN_S
+
+    def _due(self, guard: Guard, supply: HVSupply) -> float:
+        """When the supply is to be polled, if nothing comes before."""
+        longest = self._polled_at + LONGEST_TURN_S
+        return longest if self._awaits(guard, supply) else min(supply.next_poll, longest)
 
     def _heard(self, now: float) -> None:
         """The engine turns: what it lent is its own again."""
@@ -243,6 +269,7 @@ class Server:
     def _find_again(self) -> None:
         """Open a link that was lost as soon as it is back; the off is sent at once then."""
         now = self._clock.now()
+        self._descriptor = None  # of what is gone
         if self._lost_at is None:
             self._lost_at = now
         if self._link.reopen():
@@ -256,13 +283,21 @@ class Server:
         now = self._clock.now()
         self._words.speak()
         self._tick_log(now)
-        due = self._supply.next_poll if self._supply is not None else now + LONGEST_TURN_S
-        wait = min(max(due - now, SHORTEST_TURN_S), LONGEST_TURN_S)
+        guard, supply = self._guard, self._supply
+        awaits = guard is not None and supply is not None and self._awaits(guard, supply)
+        due = now if guard is None or supply is None else self._due(guard, supply)
+        wait = LONGEST_TURN_S if supply is None else min(max(due - now, SHORTEST_TURN_S), LONGEST_TURN_S)
+        self._came = self._descriptor is None
         if self._channel.closed:
+            self._came = True
             self._clock.sleep_until(now + wait)
         else:
             self._channel.flush()
-            select.select([self._channel], [], [], wait)
+            watched: list[Channel | int] = [self._channel]
+            if awaits and self._descriptor is not None:
+                watched.append(self._descriptor)
+            readable, _, _ = select.select(watched, [], [], wait)
+            self._came |= self._descriptor in readable
 
     def _fault(self, error: BaseException) -> None:
         guard = self._guard
@@ -357,6 +392,7 @@ class Server:
         self._guard = Guard(self._supply, limits, film, ramp, self._tell_command, fresh, second, self._engine)
         if self._monitor is not None:
             self._monitor.gain = float(message["second_gain"])
+        gc.freeze()  # a search for garbage through all that was made until now would hold the loop up
 
     def _answer(self, message: Message) -> None:
         guard, supply = self._guard, self._supply

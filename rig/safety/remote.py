@@ -121,6 +121,10 @@ class RemoteGuard:
         """Number of the guard's process."""
         return self._process.pid
 
+    def fileno(self) -> int:
+        """Of the channel to the guard's process."""
+        return self._channel.fileno()
+
     def opened(self) -> None:
         """Wait until the process has opened the link; nothing has been sent to the supply by then.
 

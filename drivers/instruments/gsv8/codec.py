@@ -24,8 +24,9 @@ What this protocol cannot show
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from drivers.roles import Identity
 
@@ -36,6 +37,7 @@ SUFFIX = 0x85
 MAX_FRAME = 68  # a measured frame of 16 float channels
 
 _TYPES: dict[int, FrameType] = {1: "int16", 2: "int24", 3: "float32"}
+_FLOATS = 0x80 | 3 << 4  # the upper half of the third byte of a measured frame of floats
 WIDTH: dict[FrameType, int] = {"int16": 2, "int24": 3, "float32": 4}
 
 STOP_TRANSMISSION = 0x23
@@ -130,8 +132,7 @@ class Reply:
         return f"{ERRORS[self.error]} (error {self.error:02X})"
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
+class Measured(NamedTuple):
     """Measured frame. Integers are given as sent, in binary-offset coding."""
 
     type: FrameType
@@ -164,14 +165,18 @@ class Decoder:
         self.counters.setdefault("bad_frames", 0)
         self._buffer = b""
         self._expected: tuple[FrameType, int] | None = None
+        self._floats: tuple[int, int, Callable[[bytes, int], tuple[float, ...]]] | None = None
 
     def expect(self, frame_type: FrameType, channels: int) -> None:
         """Accept measured frames of this shape only."""
+        self._floats = None
         self._expected = (frame_type, channels)
+        if frame_type == "float32":
+            self._floats = 0x10 | channels - 1, 4 + 4 * channels, struct.Struct(f">{channels}f").unpack_from
 
     def expect_any(self) -> None:
         """Accept measured frames of every shape."""
-        self._expected = None
+        self._expected = self._floats = None
 
     def feed(self, data: bytes) -> list[Message]:
         """Frames completed by ``data``, in order."""
@@ -179,6 +184,8 @@ class Decoder:
         messages: list[Message] = []
         at = 0
         while True:
+            if self._floats is not None:
+                at = self._take_floats(buffer, at, messages, *self._floats)
             start = buffer.find(PREFIX, at)
             if start < 0:
                 start = len(buffer)
@@ -196,6 +203,25 @@ class Decoder:
             at += length
         self._buffer = buffer[at:]
         return messages
+
+    @staticmethod
+    def _take_floats(
+        buffer: bytes,
+        at: int,
+        messages: list[Message],
+        second: int,
+        length: int,
+        unpack: Callable[[bytes, int], tuple[float, ...]],
+    ) -> int:
+        """Take the frames of floats that follow each other from ``at`` on: of a stream nearly all. Gives their end."""
+        last = len(buffer) - length
+        while at <= last and buffer[at] == PREFIX and buffer[at + 1] == second and buffer[at + length - 1] == SUFFIX:
+            third = buffer[at + 2]
+            if third & 0xF0 != _FLOATS:
+                break
+            messages.append(Measured("float32", unpack(buffer, at + 3), third & 1 != 0, third & 2 != 0))
+            at += length
+        return at
 
     def _length(self, buffer: bytes, at: int) -> int | None:
         """Length of the frame at ``at``; 0 when there cannot be one, None while bytes are missing to know."""

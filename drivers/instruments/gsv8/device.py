@@ -40,7 +40,7 @@ from drivers.instruments.gsv8.codec import (
     identity,
 )
 from drivers.links.link import ByteLink, DeviceError, DeviceRefused
-from drivers.roles import ForceSample, Identity, SampleFlag
+from drivers.roles import OK, ForceSample, Identity, SampleFlag
 from drivers.stream import Stream
 
 _QUIET_S = 0.05  # frames still on their way after the stream was stopped
@@ -256,7 +256,7 @@ class GSV8:
 
     def _sample(self, frame: Measured) -> ForceSample | None:
         reading = (frame.values[self._channel - 1] - self._offset) * self._gain
-        flags = SampleFlag(0)
+        flags = OK
         if frame.six_axis_error:
             flags |= SampleFlag.SENSOR_ERROR
         if frame.overload:

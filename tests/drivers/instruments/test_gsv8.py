@@ -163,6 +163,30 @@ def test_any_split_decodes_to_the_same_messages(pieces: list[bytes], data: st.Da
     assert parts.counters == whole.counters
 
 
+def test_a_stream_is_read_fast_as_it_is_frame_by_frame() -> None:
+    """Damaged at random: the short way through frames that follow each other changes nothing."""
+    rng = random.Random(2)
+    for _ in range(150):
+        stream = bytearray()
+        for _ in range(30):
+            frame = rng.choice(
+                [floats(*(rng.gauss(0, 1) for _ in range(8)), status=rng.choice([0xB0, 0xB3]))] * 4 + [answer()]
+            )
+            stream += frame[: rng.choice([len(frame)] * 8 + [rng.randrange(len(frame))])]
+        for _ in range(rng.randrange(6)):
+            stream[rng.randrange(len(stream))] = rng.choice([0xAA, 0x85, 0x17, 0xB0, rng.randrange(256)])
+        short, long = Decoder(), Decoder()
+        for decoder in (short, long):
+            decoder.expect("float32", 8)
+        long._floats = None
+        at = 0
+        while at < len(stream):
+            piece = bytes(stream[at : at + rng.randrange(1, 200)])
+            at += len(piece)
+            assert repr(short.feed(piece)) == repr(long.feed(piece))
+        assert short.counters == long.counters
+
+
 def test_the_buffer_is_bounded() -> None:
     decoder = Decoder()
     rng = random.Random(1)

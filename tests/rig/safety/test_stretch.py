@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from model.membrane.solve import solve
@@ -13,7 +14,7 @@ from rig.base.toml_file import parse_table
 from rig.protocol.plan import plan
 from rig.protocol.predict import check_plan
 from rig.protocol.protocol import Protocol
-from rig.safety.limits import FilmLimits, Limits, StretchLimit
+from rig.safety.limits import FilmLimits, Limits, Line, StretchLimit
 from rig.scene.scene import Scene
 from tests.protocols import TO_THE_FILM
 
@@ -49,3 +50,13 @@ def test_guard_and_watch_hold_it_at_the_displacement_measured() -> None:
                     check(h)
     watch.check(float("nan"), "before contact")
     StretchLimit(scene("").specimen.specimen(), Limits.of(scene(""))).check(1.0, "nothing is known")
+
+
+def test_straight_lines_are_those_of_numpy_to_the_bit() -> None:
+    rng = np.random.default_rng(1)
+    for count in (2, 3, 17, 33):
+        x = np.sort(rng.uniform(0.0, 0.015, count))
+        y = rng.standard_normal(count)
+        line = Line(x, y)
+        for h in (*rng.uniform(-0.002, 0.017, 100), *x):
+            assert line(float(h)) == float(np.interp(h, x, y))
