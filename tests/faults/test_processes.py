@@ -131,7 +131,7 @@ def slow_stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGKILL, signal.SIGSTOP, signal.SIGUSR1],
+    [signal.SIGKILL, signal.SIGSTOP, pytest.param(signal.SIGUSR1, marks=pytest.mark.long)],
     ids=["killed", "stopped", "busy"],
 )
 def test_engine_gone_on_the_way_to_contact_leaves_the_stage_within_a_leg(
@@ -293,7 +293,7 @@ def test_an_adapter_that_is_pulled_and_comes_back_is_found_again_and_the_output_
     assert "is open again" in "".join(m.fields["message"] for m in log.messages("/event"))
 
 
-@pytest.mark.parametrize("first", ["guard killed", "pulled"])
+@pytest.mark.parametrize("first", ["guard killed", pytest.param("pulled", marks=pytest.mark.long)])
 def test_a_guard_killed_while_the_adapter_is_out_leaves_the_engine_to_take_the_output_off(
     stand: Stand, live: Run, first: str
 ) -> None:

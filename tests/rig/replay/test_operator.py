@@ -44,7 +44,7 @@ def recorded_with(typed, folder, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steered", [False, True])
+@pytest.mark.parametrize("steered", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_stop(tmp_path, monkeypatch, steered):
     recording = recorded_with({211: "s"}, tmp_path, monkeypatch)
     assert recording.log.outcome["status"] == "stopped"

@@ -103,8 +103,7 @@ def test_without_arm_there_is_no_high_voltage_and_no_log(scene: Path, ports: Pat
     "number",
     [
         signal.SIGTERM,
-        *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGINT, signal.SIGHUP)),
-        signal.SIGQUIT,
+        *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)),
     ],
 )
 def test_a_signal_ends_a_run_safely(
