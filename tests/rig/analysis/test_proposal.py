@@ -166,7 +166,7 @@ def experiment(protocol: Protocol, seed: int) -> list[Curve]:
 @pytest.mark.parametrize(
     ("experiments", "known_to"),
     [
-        pytest.param(12, 0.2, marks=pytest.mark.slow),
+        pytest.param(12, 0.2, marks=pytest.mark.long),  # what is expected of it: above
         pytest.param(100, 0.07, marks=[pytest.mark.long, pytest.mark.timeout(600)]),
     ],
 )

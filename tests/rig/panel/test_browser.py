@@ -127,7 +127,7 @@ def watched(stand: Stand, browser: Any, tmp_path: Path) -> Iterator[Callable[[Pa
         live.close()
 
 
-@pytest.mark.parametrize("by", ["click", "key"])
+@pytest.mark.parametrize("by", ["click", pytest.param("key", marks=pytest.mark.long)])
 def test_stop_takes_the_voltage_off_and_the_log_says_who(
     watched: Callable[[Path], Live], stand: Stand, by: str
 ) -> None:
