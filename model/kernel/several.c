@@ -131,16 +131,16 @@ static int64_t begun_at(const Task *task, int64_t modes) {
 static void seek_zones(Pack *pack) {
     Points at;
     Cut whole;
-    Real fine[MOST_ELEMENTS][FINE];
+    Tensions seen;
     pack->problem.counts = lanes_where(pack, FOLDED);
     evaluate(&pack->problem, &pack->grid, &pack->state, NULL, &at);
     uncut(&pack->grid, &pack->state, &whole);
-    tensions(&whole, &at, fine);
+    tensions(&whole, &at, &seen);
     for (int64_t k = 0; k < pack->members; k++) {
         One *one = pack->of[k];
         if (one->status != FOLDED) continue;
         one->status = LEFT_TO_OTHERS;
-        if (!zones_now(&whole, (const Real(*)[FINE])fine, of(0.0), 0.0, k, &one->zones)) continue;
+        if (!zones_now(&whole, &seen, k, &one->zones)) continue;
         one->modes = modes_for(&one->zones, pack->task->first_modes);
         one->status = begun_at(pack->task, one->modes);
         one->previous = one->tail_before = NAN;
@@ -231,17 +231,18 @@ static void put_down_cut(const Cut *cut, int64_t lane, One *one) {
 static void tell_cut(Pack *pack, const Cut *cut, Real lam) {
     Problem *problem = &pack->problem;
     Points at[MOST_ELEMENTS];
-    Real fine[MOST_ELEMENTS][FINE];
+    Tensions seen;
     Extremes x;
     Derivatives d;
     problem->counts = lanes_where(pack, WRINKLED);
     evaluate_cut(problem, cut, at);
-    Real most = tensions(cut, at, fine);
+    tensions(cut, at, &seen);
+    allow(&seen, pack->task->tolerance);
     for (int64_t k = 0; k < pack->members; k++) {
         One *one = pack->of[k];
         Zones now;
         if (one->status != WRINKLED) continue;
-        int good = zones_now(cut, (const Real(*)[FINE])fine, most, wrong_sign(pack->task->tolerance), k, &now);
+        int good = zones_now(cut, &seen, k, &now);
         if (good && has_zones(cut, &now, k)) continue;
         one->status = FOLDED;
         one->steps = one->plain_steps;

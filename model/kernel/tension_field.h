@@ -16,6 +16,7 @@ enum {
 #define CUT_POWER 2.6
 #define CUT_GOAL 0.9 /* a cut stays where it has settled: what it lacks must leave room for the rest of the estimate */
 #define CURVED 2.0
+#define UNSEEN 0.3 /* of the tolerance: share of the pull along the film that a zone which is not cut out may push around */
 #define SLACK_GOALS 5.0 /* times Newton's goal: share of the largest tension that may have a wrong sign */
 
 /* Breaks moved to where the hoop tension of the panels vanishes, in `breaks`; returns the largest shift over an
@@ -193,20 +194,53 @@ static Iterate settle(Problem *problem, Cut *cut, double aim) {
     return found;
 }
 
-/* Hoop tension at the FINE points of every element, and where wrinkled the slack in the width; returns the largest. */
-static Real tensions(const Cut *cut, const Points *at, Real (*fine)[FINE]) {
-    Real values[MOST_POINTS], most = of(0.0);
-    int64_t n = points_of(cut);
-    for (int64_t k = 0; k < cut->elements; k++) {
-        for (int64_t i = 0; i < n; i++) values[i] = cut->folded[k] ? at[k].hoop[i] - at[k].log[n + i] : at[k].law.t2[i];
-        refined(cut->grid[k].table, values, fine[k]);
-        for (int64_t i = 0; i < FINE; i++) most = larger(most, abs_of(fine[k][i]));
+/* What the zones are judged by: hoop tension at the FINE points of every element, and where wrinkled the slack in the
+   width; the largest of them; how much the film pulls along, and taut elements push around; and the shares of the
+   largest and of the pull that may have a wrong sign. */
+typedef struct {
+    Real fine[MOST_ELEMENTS][FINE], most, pull, push;
+    double slack, unseen;
+} Tensions;
+
+/* What a taut element pushes around, where its hoop stress has the wrong sign. */
+static Real pushed(const Grid *grid, const Real *fine) {
+    const double *place = grid->table->fine_xi;
+    Real total = of(0.0), before = total, before_x = grid->left;
+    for (int64_t i = 0; i < FINE; i++) {
+        Real x = grid->left + 0.5 * (1.0 + place[i]) * (grid->right - grid->left), now = larger(-fine[i], of(0.0));
+        if (any(now > 0.0)) now *= exp_of(2.0 * x);
+        total += 0.5 * (now + before) * (x - before_x);
+        before = now;
+        before_x = x;
     }
-    return most;
+    return total;
+}
+
+/* Those of a state, with no wrong sign allowed. */
+static void tensions(const Cut *cut, const Points *at, Tensions *out) {
+    Real values[MOST_POINTS];
+    int64_t n = points_of(cut);
+    out->most = out->pull = out->push = of(0.0);
+    out->slack = out->unseen = 0.0;
+    for (int64_t k = 0; k < cut->elements; k++) {
+        for (int64_t i = 0; i < n; i++) {
+            values[i] = cut->folded[k] ? at[k].hoop[i] - at[k].log[n + i] : at[k].law.t2[i];
+            out->pull += cut->grid[k].twice[i] * at[k].law.t1[i];
+        }
+        refined(cut->grid[k].table, values, out->fine[k]);
+        for (int64_t i = 0; i < FINE; i++) out->most = larger(out->most, abs_of(out->fine[k][i]));
+        if (!cut->folded[k]) out->push += pushed(&cut->grid[k], out->fine[k]);
+    }
 }
 
 /* Share of the largest tension that may have a wrong sign: `wrong_sign`. */
 static double wrong_sign(double tolerance) { return SLACK_GOALS * goal(fmax(tolerance, 1e-8)); }
+
+/* Allow the wrong signs of a state that is solved to the tolerance. */
+static void allow(Tensions *seen, double tolerance) {
+    seen->slack = wrong_sign(tolerance);
+    seen->unseen = UNSEEN * tolerance;
+}
 
 /* Numbers of one lane. */
 static void lane_of(const Real *all, int64_t lane, int64_t numbers, double *out) {
@@ -218,8 +252,10 @@ static void breaks_of(const Cut *cut, int64_t lane, double *out) {
 }
 
 /* Zones where the hoop tension of those of `old`, at the FINE points, changes sign: `zones`, `_cut`. A sign against an
-   element's own kind counts only beyond `bound`. Returns whether there is a wrinkled zone, and not too many. */
-static int find_zones(const Zones *old, const double (*fine)[FINE], const double *place, double bound, Zones *out) {
+   element's own kind counts only beyond `bound` where wrinkled and beyond `push` where taut. Returns whether there is a
+   wrinkled zone, and not too many. */
+static int find_zones(const Zones *old, const double (*fine)[FINE], const double *place, double bound, double push,
+                      Zones *out) {
     double before = 0.0, before_x = 0.0;
     out->elements = 1;
     out->breaks[0] = old->breaks[0];
@@ -227,7 +263,7 @@ static int find_zones(const Zones *old, const double (*fine)[FINE], const double
         for (int64_t i = 0; i < FINE; i++) {
             double value = fine[k][i], length = old->breaks[k + 1] - old->breaks[k];
             double x = old->breaks[k] + 0.5 * (1.0 + place[i]) * length;
-            int64_t folded = old->folded[k] ? value < bound : value < -bound;
+            int64_t folded = old->folded[k] ? value < bound : value < -push;
             if (k == 0 && i == 0) out->folded[0] = folded;
             if (folded != out->folded[out->elements - 1]) {
                 if (out->elements == MOST_ELEMENTS) return 0;
@@ -243,16 +279,20 @@ static int find_zones(const Zones *old, const double (*fine)[FINE], const double
     return out->elements > 1 || out->folded[0];
 }
 
-/* The zones that the state of one lane has now; `most` of the tensions. */
-static int zones_now(const Cut *cut, const Real (*fine)[FINE], Real most, double share, int64_t lane, Zones *out) {
+/* The zones that the state of one lane has now. */
+static int zones_now(const Cut *cut, const Tensions *seen, int64_t lane, Zones *out) {
     Zones old;
-    double own[MOST_ELEMENTS][FINE], largest;
+    double own[MOST_ELEMENTS][FINE], most, pull, push;
     old.elements = cut->elements;
     memcpy(old.folded, cut->folded, sizeof old.folded);
     breaks_of(cut, lane, old.breaks);
-    for (int64_t k = 0; k < cut->elements; k++) lane_of(fine[k], lane, FINE, own[k]);
-    lane_of(&most, lane, 1, &largest);
-    return find_zones(&old, (const double(*)[FINE])own, cut->grid[0].table->fine_xi, share * largest, out);
+    for (int64_t k = 0; k < cut->elements; k++) lane_of(seen->fine[k], lane, FINE, own[k]);
+    lane_of(&seen->most, lane, 1, &most);
+    lane_of(&seen->pull, lane, 1, &pull);
+    lane_of(&seen->push, lane, 1, &push);
+    double bound = seen->slack * most;
+    return find_zones(&old, (const double(*)[FINE])own, cut->grid[0].table->fine_xi, bound,
+                      push > seen->unseen * pull ? 0.0 : bound, out);
 }
 
 /* Whether one lane has these zones, and every cut still separates two elements. */
@@ -417,16 +457,17 @@ static int fold(Problem *problem, const Table *const *tables, const int64_t *fir
                 const Grid *grid, const State *state, Points *at, Cut *cut, Iterate *found, double *error) {
     Cut old;
     Zones zones, now;
-    double fine[MOST_ELEMENTS][FINE];
+    Tensions seen;
     uncut(grid, state, &old);
-    tensions(&old, at, fine);
-    int good = zones_now(&old, (const Real(*)[FINE])fine, 0.0, 0.0, 0, &zones);
+    tensions(&old, at, &seen);
+    int good = zones_now(&old, &seen, 0, &zones);
     for (int64_t round = 0; round < ROUNDS && good; round++) {
         int64_t modes = modes_for(&zones, first_modes);
         int status = refine_cut(problem, tables, modes, tolerance, &old, &zones, cut, at, found, error);
         if (status != WRINKLED) return status;
-        double most = tensions(cut, at, fine);
-        good = zones_now(cut, (const Real(*)[FINE])fine, most, wrong_sign(tolerance), 0, &now);
+        tensions(cut, at, &seen);
+        allow(&seen, tolerance);
+        good = zones_now(cut, &seen, 0, &now);
         if (good && has_zones(cut, &now, 0)) return WRINKLED;
         old = *cut;
         zones = now;

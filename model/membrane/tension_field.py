@@ -32,6 +32,7 @@ START_MODES = 5
 MOST_ZONES = 5
 ROUNDS = 4
 MISSED = 0.02  # of the tolerance: third power of a wrong tension that changes the force of a soft film by a tenth of it
+UNSEEN = 0.3  # of the tolerance: share of the pull along the film that a zone which is not cut out may push around
 SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a wrong sign, as it has beside a cut
 STEPS, CAREFUL_STEPS = 15, 40  # most of a rung
 CALM = 1e-4  # change of the strains from which a careful solution moves its cuts
@@ -104,12 +105,15 @@ class Zones:
     where: Array  # (MOST_ZONES - 1, S): ln(R/b) of the changes, in order
 
 
-def zones(grid: Grid, state: State, at: Points, slack: float = 0.0, *, between: bool = True) -> Zones:
+def zones(
+    grid: Grid, state: State, at: Points, slack: float = 0.0, unseen: float = 0.0, *, between: bool = True
+) -> Zones:
     """Zones of a state, by the hoop stress where taut and by the slack in the width where wrinkled.
 
     A sign against the element's own kind counts only beyond ``slack`` times the largest value: with cuts in place their
-    vicinity is round-off. Without ``between`` the points alone are asked, and both ends of taut elements: near loss of
-    convexity the stretch is too steep for the polynomial through them.
+    vicinity is round-off. Smaller ones count where what taut elements push around is more than a share ``unseen`` of
+    what the film pulls along: its force errs by about as much. Without ``between`` the points alone are asked, and both
+    ends of taut elements: near loss of convexity the stretch is too steep for the polynomial through them.
     """
     tension = at.law.t2 if state.relaxed is None else np.where(state.relaxed, at.hoop - at.log[1], at.law.t2)
     points, m, states = tension.shape
@@ -132,7 +136,13 @@ def zones(grid: Grid, state: State, at: Points, slack: float = 0.0, *, between: 
     if slack > 0.0 and whole and state.relaxed is not None:
         kind = np.repeat(state.relaxed[0], len(share), axis=0)
         bound = slack * np.maximum(fine.max(axis=0), -fine.min(axis=0))
+        every = np.where(kind, fine < bound, folded)
         folded = np.where(kind, fine < bound, fine < -bound)
+        pushed = np.where(kind, 0.0, np.maximum(-fine, 0.0)).reshape(m, len(share), states)
+        x = grid.breaks[:-1, None] + share[:, None] * (grid.breaks[1:] - grid.breaks[:-1])[:, None]
+        pushed *= np.exp(2.0 * x)
+        missed = (0.5 * (pushed[:, 1:] + pushed[:, :-1]) * np.diff(x, axis=1)).sum(axis=(0, 1))
+        folded = np.where(missed > unseen * (grid.twice * at.law.t1).sum(axis=(0, 1)), every, folded)
     flips = folded[1:] != folded[:-1]
     changes = flips.sum(axis=0)
     where = np.full((MOST_ZONES - 1, states), np.nan)
@@ -346,7 +356,7 @@ def _round(
             continue
         part, grid, chosen = here.take(some), start.grid.take(some), state.take(some)
         at = ritz.evaluate(part, grid, chosen)
-        zone = zones(grid, chosen, at, slack=wrong_sign(tolerance, careful), between=not careful)
+        zone = zones(grid, chosen, at, wrong_sign(tolerance, careful), UNSEEN * tolerance, between=not careful)
         pattern = 2 * zone.changes + zone.first
         for number in np.unique(pattern).tolist():
             changes, first = number // 2, bool(number % 2)
@@ -379,7 +389,8 @@ def _round(
                         answer.grid,
                         answer.state,
                         ritz.evaluate(solved, answer.grid, answer.state),
-                        slack=wrong_sign(tolerance, careful),
+                        wrong_sign(tolerance, careful),
+                        UNSEEN * tolerance,
                         between=not careful,
                     )
                     same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
