@@ -1,10 +1,12 @@
 """Where to measure next, so that a film is known well enough in the least time: the choice of a closed loop.
 
-What a second of holding the film at a place tells is that of `calibration.film.planning.Places`. One reading ``r`` (a
-row of derivatives over its standard deviation) takes the variance ``v = w' M^-1 w`` of what is wanted to
-``v - t (w' M^-1 r)^2 / (1 + t r' M^-1 r)`` in ``t`` seconds (Sherman & Morrison), with ``M`` the information of all
-that was recorded. The next place is the one that lowers the logarithms of the variances most per second, the way there
-counted (sequential c-optimality; Wynn 1970).
+After each fit the whole rest is planned anew (`calibration.film.least_time`): the places and seconds that take every
+wish to its target by what the fit says of the film, and the ways between them, since a change of the voltage may cost
+as much as a hold. The best plan of a few sets of voltages is begun: first what it holds at the present voltage. Half of
+what belongs to 0 V comes before the high voltage and half after it, so that a film or a sensor that changes with time
+does not pass for an effect of the voltage; the way back to 0 V has to be gone anyway. No hold is longer than all
+that was held before, so that a plan made with little knowledge does not go far. A fit takes its time while the film is
+held where the plan wants it.
 
 A claim is not believed below what the information of these data says for the film of the scene with all its parameters
 free. With few places a term of the law may vanish in the fit; then it states less uncertainty than it has, and whoever
@@ -21,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.curve import Curve
+from calibration.film.least_time import least_time
 from calibration.film.planning import Places, one_term
 from calibration.film.result import Identification, Quantity
 from model.specimen import Specimen
@@ -32,10 +35,13 @@ from rig.steps.wanted import BY_TIME, Wanted
 Array = NDArray[np.float64]
 
 QUANTITIES = ("stiffness", "eps_r")  # in the order of `Places.wanted`
-HOLDS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-TURN_S = 2.0  # what a question costs: the film is held where it is meanwhile
-LITTLE = 0.05  # weight of what is known well enough already
-CONFIRM_S = 8.0  # of new data before a claim is believed
+FIRST_S = 8.0  # hold at most, while little was held before
+LEAST_S = 1.0  # of a hold worth it
+TURN_S = 2.0  # what a question takes: the film is held where it is meanwhile, and that is data
+CONFIRM, CONFIRM_S = 0.02, (1.0, 8.0)  # new data before a claim is believed: share of the time spent, from, to
+AIM = 0.99  # times the uncertainty that is wanted: a hold that ends just short of it costs another fit
+LEAST_ROOM = 0.9  # what stays counts at most as so much of a wish, in a plan
+TRUST = 4.0  # by what factor a variance that a fit claims may move what is planned
 HOPELESS = 3  # fits in a row that say that it cannot be reached
 MET_WORDS = "known well enough, and so said the fit before"
 FIRST_STRETCH = 1.25  # times the pre-stretch: where the stiffness is wanted before there is a fit
@@ -72,7 +78,9 @@ class Learner:
         stands = {} if found is None else self.standing(curves, found)
         known = () if found is None else self._known(stands, found, question.spent_s)
         if len(known) < len(self.wanted):
-            return replace(self._next(curves, found, question, {}, "first places: there is no fit yet"), known=known)
+            names = [one.name for one in self.wanted]
+            first = self._next(curves, found, question, stands, names, "first places: there is no fit of all yet")
+            return replace(first, known=known)
         open_ = [one for one in known if one.outcome is Kind.TIME]
         lost = [one for one in known if one.outcome is Kind.UNREACHABLE]
         told = _about(max(open_ or lost or known, key=lambda one: one.relative / one.wanted), known)
@@ -82,17 +90,18 @@ class Learner:
         if question.left_s <= TURN_S:
             return replace(told, kind=Kind.TIME, reason="the time is out")
         missing = [one.quantity for one in open_ if one.relative > one.wanted]
-        weights = {one.quantity: 1.0 if one.quantity in missing else LITTLE for one in known}
-        reason = "tells most per second" if missing else "known well enough; confirmed by new data"
-        next_one = self._next(curves, found, question, weights, reason)
-        wishes = {one.name: one for one in self.wanted}
+        if not missing:
+            seconds = min(max(CONFIRM * question.spent_s, CONFIRM_S[0]), CONFIRM_S[1])
+            reason = "known well enough; confirmed by new data"
+            return replace(told, reason=reason, h=question.h, voltage=question.voltage, hold_s=seconds, expected_s=0.0)
+        after = self._next(curves, found, question, stands, missing, "least time to what is wanted")
         return replace(
             told,
-            reason=reason,
-            h=next_one.h,
-            voltage=next_one.voltage,
-            hold_s=next_one.hold_s if missing else CONFIRM_S,
-            expected_s=max((_time_left(stands[name], wishes[name], question.spent_s) for name in missing), default=0.0),
+            reason=after.reason,
+            h=after.h,
+            voltage=after.voltage,
+            hold_s=after.hold_s,
+            expected_s=after.expected_s,
         )
 
     def _known(
@@ -128,7 +137,8 @@ class Learner:
     def standing(self, curves: Sequence[Curve], fit: Identification) -> dict[str, tuple[float, float]]:
         """By name of what is wanted: relative standard uncertainty, and what of it no time makes smaller."""
         believed = self._places(curves, believed_film(self._specimen, fit.terms), fit.stretch)
-        inverse = np.linalg.inv(believed.prior + self._information(believed, curves))
+        held = self._seconds(believed, curves)
+        inverse = np.linalg.inv(believed.prior + (believed.rows * held[:, None]).T @ believed.rows)
         least = np.sqrt(np.einsum("jp,pq,jq->j", believed.wanted, inverse, believed.wanted)).tolist()
         found = {}
         for one, quantity in ((one, fit.quantities[one.name]) for one in self.wanted if one.name in fit.quantities):
@@ -144,35 +154,68 @@ class Learner:
         curves: Sequence[Curve],
         found: Identification | None,
         question: Ask,
-        weights: Mapping[str, float],
+        stands: Mapping[str, tuple[float, float]],
+        missing: Sequence[str],
         reason: str,
     ) -> Advice:
+        """The beginning of the best plan for what is ``missing``."""
         specimen, stretch = self._specimen, (FIRST_STRETCH * self._specimen.prestretch, self._specimen.prestretch)
         if found is not None:
             specimen, stretch = specimen.with_material(found.material), found.stretch
         places = self._places(curves, specimen, stretch)
-        names = QUANTITIES[: len(places.wanted)]
-        asked = {one.name for one in self.wanted}
-        weight = np.array([weights.get(name, 1.0 if name in asked else 0.0) for name in names])
-        inverse = np.linalg.inv(places.prior + self._information(places, curves))
-        toward = places.rows @ inverse  # (K, P)
-        variance = np.einsum("jp,pq,jq->j", places.wanted, inverse, places.wanted)
-        gain_per = (places.wanted @ toward.T) ** 2 / variance[:, None]  # (J, K)
-        size = np.einsum("kp,kp->k", toward, places.rows)
-        holds = np.array(HOLDS_S)[:, None]
-        way = self._way(places, question)
-        lower = holds * gain_per[:, None] / (1.0 + holds * size)  # (J, D, K), of each variance
-        gain = np.einsum("j,jdk->dk", weight, -np.log1p(-np.minimum(lower, 1.0 - 1e-12)))
-        rate = gain / (holds + way + TURN_S)
-        rate[(holds + way) > max(question.left_s, HOLDS_S[0])] = -1.0
-        d, k = np.unravel_index(int(rate.argmax()), rate.shape)
-        return Advice(Kind.GO, reason, float(places.h[k]), float(places.voltage[k]), HOLDS_S[d])
+        held = self._seconds(places, curves)
+        known = places.prior + (places.rows * held[:, None]).T @ places.rows
+        target = self._targets(places, known, stands, missing)
+        plan = min((self._plan(places, known, target, levels, question) for levels in self._sets(places, question)),
+                   key=lambda one: (one.excess, one.total))  # fmt: skip
+        h, voltage, seconds = _begin(places, plan.seconds, held, question)
+        seconds = min(seconds, max(FIRST_S, float(held.sum())))
+        return Advice(Kind.GO, reason, h, voltage, max(seconds - TURN_S, LEAST_S), expected_s=plan.total)
+
+    def _targets(
+        self, places: Places, known: Array, stands: Mapping[str, tuple[float, float]], missing: Sequence[str]
+    ) -> Array:
+        """Variance that is wanted of each of ``places.wanted``, by the information; inf: nothing is wanted of it.
+
+        A fit may claim more, or less, than its information says; the target moves by as much.
+        """
+        now = np.einsum("jp,pj->j", places.wanted, np.linalg.solve(known, places.wanted.T)).tolist()
+        target = np.full(len(places.wanted), np.inf)
+        for wish in self.wanted:
+            if wish.name in missing:
+                which = QUANTITIES.index(wish.name)
+                relative, stays = stands.get(wish.name, (math.inf, 0.0))
+                room = AIM**2 * (wish.relative**2 - min(stays, LEAST_ROOM * wish.relative) ** 2)
+                claimed = relative**2 - stays**2
+                more = now[which] / claimed if math.isfinite(claimed) and claimed > 0.0 else 1.0
+                target[which] = room * min(max(more, 1.0 / TRUST), TRUST)
+        return target
+
+    def _sets(self, places: Places, question: Ask) -> list[tuple[float, ...]]:
+        """Sets of voltages that a plan may use: at most the present one, 0 V and another."""
+        levels = np.unique(places.voltage).tolist()
+        here = min(levels, key=lambda one: abs(one - question.voltage))
+        sets = {frozenset(one) for v in levels for one in ((here,), (v,), (here, v), (0.0, v), (here, 0.0, v))}
+        return sorted(tuple(sorted(one)) for one in sets)
+
+    def _plan(self, places: Places, known: Array, target: Array, levels: tuple[float, ...], question: Ask) -> _Plan:
+        """The best plan with these voltages, the way back to 0 V in its time."""
+        ramp = self.scene.hv.ramp_V_per_s if self.scene.hv is not None else math.inf
+        way, at = 0.0, question.voltage
+        here = [one for one in levels if abs(one - at) < 1.0]
+        for level in [*here, *sorted(set(levels) - set(here), reverse=True), 0.0]:
+            way += abs(level - at) / ramp + self.settle_s * (level != at)
+            at = level
+        these = np.flatnonzero(np.isin(places.voltage, levels)).tolist()
+        longest = max(question.left_s - way, FIRST_S)
+        excess, seconds = least_time(places, known, target, these, longest)
+        return _Plan(max(excess, 1.0), float(seconds.sum()) + way, seconds)
 
     def _places(self, curves: Sequence[Curve], specimen: Specimen, stretch: tuple[float, float]) -> Places:
         return Places(specimen, self.h, self.voltage, self.scene.rates["force"], curves[0], stretch)
 
-    def _information(self, places: Places, curves: Sequence[Curve]) -> Array:
-        """That of the samples recorded so far, each at the nearest place."""
+    def _seconds(self, places: Places, curves: Sequence[Curve]) -> Array:
+        """Seconds recorded so far, each sample at the nearest place."""
         seconds = np.zeros(places.h.size)
         for curve in curves:
             here = np.flatnonzero(np.abs(places.voltage - curve.nominal_voltage) < 1.0)
@@ -180,15 +223,32 @@ class Learner:
                 h = curve.h[curve.usable]
                 nearest = here[np.abs(places.h[here][:, None] - h).argmin(axis=0)]
                 seconds += np.bincount(nearest, minlength=seconds.size) / self.scene.rates["force"]
-        information: Array = (places.rows * seconds[:, None]).T @ places.rows
-        return information
+        return seconds
 
-    def _way(self, places: Places, question: Ask) -> Array:
-        """Seconds from where the film is to each place."""
-        ramp = self.scene.hv.ramp_V_per_s if self.scene.hv is not None else math.inf
-        change = np.abs(places.voltage - question.voltage)
-        way: Array = np.abs(places.h - question.h) / self.speed + change / ramp + self.settle_s * (change > 0.0)
-        return way
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """Largest ratio of a variance to its target (1: all are met), time with the ways (s), seconds at each place."""
+
+    excess: float
+    total: float
+    seconds: Array
+
+
+def _begin(places: Places, seconds: Array, held: Array, question: Ask) -> tuple[float, float, float]:
+    """Displacement, voltage and seconds of the hold that the plan begins with."""
+    levels = np.unique(places.voltage)
+    here = levels[np.abs(levels - question.voltage).argmin()]
+    planned = {float(one): float(seconds[places.voltage == one].sum()) for one in levels}
+    stay = planned.pop(float(here))
+    others = max(planned.values(), default=0.0)
+    if here == 0.0 and others > LEAST_S:
+        stay = 0.5 * (stay - float(held[places.voltage == 0.0].sum()))
+    if stay < TURN_S and others > LEAST_S:
+        here = max(planned, key=lambda one: (planned[one] > LEAST_S, one))
+        stay = planned[here]
+    k = int(np.argmax(np.where(places.voltage == here, seconds, -1.0)))
+    return float(places.h[k]), float(here), stay
 
 
 def believed_film(specimen: Specimen, terms: int) -> Specimen:

@@ -1,6 +1,6 @@
 """``do = "learn"``: measure where it tells most, fit, and go on until a quantity is known well enough.
 
-A closed loop. It begins with one sweep up and back at 0 V. Then it holds the film at one place (displacement and
+A closed loop. It begins with one sweep up at 0 V. Then it holds the film at one place (displacement and
 voltage) after the other; after each hold an `rig.steps.advisor.Advisor` fits all that was recorded and names the next.
 While it fits, the film is held and recorded where it is. Every place, and every way between two of them, has been held
 against the limits before anything moved (`Learning.ways`); a place that is none of these is refused.
@@ -173,9 +173,7 @@ class _Loop:
 
     def run(self) -> Turns:
         if self.number == 0:
-            top = self._action.places[0.0][-1]
-            yield from self._move(top)
-            yield from self._move(self._action.places[0.0][0])
+            yield from self._move(self._action.places[0.0][-1])
         while True:
             advice = yield from self._advised()
             if self.left <= 0.0 and advice.kind in (Kind.GO, Kind.FAILED):

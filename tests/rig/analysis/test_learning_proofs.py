@@ -112,9 +112,7 @@ class Experiment:
 
     def run(self) -> Advice:
         """To its end; the way of `rig.steps.learn`."""
-        places = connected(self.scene, self.scene.specimen.specimen())[0.0]
-        self.move(places[-1])
-        self.move(places[0])
+        self.move(connected(self.scene, self.scene.specimen.specimen())[0.0][-1])
         while True:
             self.fits += 1
             self.hold(TURN_S)
@@ -180,3 +178,25 @@ def test_its_claims_are_true_when_it_stops(experiments: int, covered: int) -> No
             inside += abs(advice.value - TRUTH.eps_r) <= 1.96 * advice.standard_uncertainty
     assert reached >= 0.8 * experiments
     assert inside >= covered / experiments * reached
+
+
+@pytest.mark.parametrize(
+    "experiments",
+    [
+        pytest.param(2, marks=[pytest.mark.slow, pytest.mark.timeout(300)]),
+        pytest.param(50, marks=[pytest.mark.long, pytest.mark.timeout(7200)]),
+    ],
+)
+def test_it_takes_a_third_of_the_uniform_sweeps_time(experiments: int) -> None:
+    """Time of the rig, all told: homing, zeros, approach, preconditioning and return are in both.
+
+    They are a minute, so that a wish that the sweep meets in less than some five minutes cannot be met in a third.
+    """
+    until = "eps_r 0.2 % noise and zeros"
+    sweep, frame = sweep_seconds(until)
+    took = []
+    for seed in range(experiments):
+        one = Experiment(until, seed)
+        assert one.run().kind is Kind.MET
+        took.append(frame + one.seconds)
+    assert float(np.median(took)) <= sweep / 3.0
