@@ -294,9 +294,10 @@ class AsciiStream(ABC, Generic[S]):
         )
 
     def _check_rate(self, now: float, lines: int) -> None:
+        if not lines:  # a poll that found nothing leaves no trace in a log, and must change nothing
+            return
         if self._counted_since == math.inf:
-            if lines:
-                self._counted_since, self._counted = now, 0
+            self._counted_since, self._counted = now, 0
             return
         self._counted += lines
         elapsed = now - self._counted_since

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Protocol, cast
 
-from drivers.links.link import DeviceError
+from drivers.links.link import DeviceError, DeviceLost
 from drivers.roles import Device, DisplacementSensor, ForceSensor, HVSupply, Remarking, Sample, Stage
 from rig.bench.devices import Link, make_device, make_supply
 from rig.bench.opening import Opened
@@ -74,9 +74,11 @@ class Bench:
         self._opened = opened
         self._supply = supply
         self._polled_at: float | None = None
+        self._tap: Tap | None = None
 
     def attach(self, tap: Tap) -> None:
         """Put the drivers on their links; from here on they may be polled."""
+        self._tap = tap
         for role, table in self.scene.instruments.items():
             if table is self.scene.hv:
                 if self._supply is not None:
@@ -101,13 +103,16 @@ class Bench:
         """New samples of one instrument.
 
         Whatever passes on its wire meanwhile is told to the tap with the time ``now``: it is all the time that the
-        driver knows, so that its samples can be worked out again from what the tap was told.
+        driver knows, so that its samples can be worked out again from what the tap was told. So is an error, which may
+        leave no other trace.
         """
         self._polled_at = now
         try:
             return self.devices[role].poll(now)
         except DeviceError as error:
             error.role = role
+            if self._tap is not None and role in self._opened.links and not isinstance(error, DeviceLost):
+                self._tap(role, "failed", b"", now)
             raise
         finally:
             self._polled_at = None

@@ -464,8 +464,7 @@ class Engine:
             # Each device its own time: data must never seem to have come before they were sent.
             now = self.clock.now()
             attention.polled(role, now)
-            for sample in self._poll(role, now):
-                self._take(role, sample, now)
+            self._take_all(role, self._poll(role, now), now)
             for remark in self.bench.remarks(role):
                 self._remark(role, remark)
         now = self.clock.now()
@@ -505,6 +504,17 @@ class Engine:
 
     def _next_turn(self, now: float) -> float:
         return _within_bounds(now, min(device.next_poll for device in self.bench.devices.values()))
+
+    def _take_all(self, role: str, samples: Sequence[Sample], now: float) -> None:
+        """Take them one by one. Of those after one that ends the run, the log has what was measured."""
+        for number, sample in enumerate(samples, 1):
+            try:
+                self._take(role, sample, now)
+            except BaseException:
+                with suppress(Exception):  # nothing may take the place of what ended the run
+                    for later in samples[number:]:
+                        self.recorder.add(later)
+                raise
 
     def _take(self, role: str, sample: Sample, now: float) -> None:
         sample = self.recorder.add(sample)

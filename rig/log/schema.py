@@ -49,9 +49,9 @@ def _flag_values(flags: type[Flag]) -> str:
     return ", ".join(f"{flag.value} {flag.name}" for flag in flags)
 
 
-Way = Literal["rx", "tx", "gone", "back"]
+Way = Literal["rx", "tx", "gone", "back", "failed"]
 WAYS: tuple[Way, ...] = get_args(Way)
-"""Read from an instrument, or sent to it; its link was lost, or works again (the last two have no data)."""
+"""Read from an instrument, or sent to it; its link was lost, or works again; a poll of it ended in an error."""
 
 _T = Field("t_s", "double", "clock time, seconds since the start of the run")
 _FLAGS = Field("flags", "fixed32", f"what is wrong with the sample, a sum of: {_flag_values(SampleFlag)}")
@@ -62,8 +62,8 @@ _RAW = Channel(
         Field(
             "data",
             "bytes",
-            "as on the wire; a CAN frame is its identifier (2 bytes, big-endian) and its data. Empty where the "
-            "link was found gone, or to work again",
+            "as on the wire; a CAN frame is its identifier (2 bytes, big-endian) and its data. Empty where "
+            "nothing passed: its link was found gone, or to work again, or the poll ended in an error",
         ),
     ),
 )

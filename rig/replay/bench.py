@@ -185,7 +185,7 @@ class ReplayBench:
                 rows = passed.setdefault(role, [])
                 if way in ("rx", "tx"):
                     rows.append(Passed(row.t, way == "tx", row.fields["data"]))
-                else:
+                elif way in ("gone", "back"):
                     changes.setdefault(role, []).append((row.t, sum(one.sent for one in rows), way == "gone"))
         for role, table in recording.experiment.scene.instruments.items():
             rows, depart = passed.get(role, []), partial(self._depart, role)

@@ -191,7 +191,7 @@ class _Rows:
 class _Stream:
     """What is known of one instrument while the log is gone through.
 
-    ``arrived``, ``sent``, ``back`` and ``gone`` (its link) belong to the poll in the making, which was at ``t``.
+    ``arrived``, ``sent``, ``back`` and ``gone`` (its link), and ``failed`` belong to the poll in the making, at ``t``.
     ``since`` is what arrived since the last sample, from ``offset`` on; it begins anew with the next poll after a
     sample (``fresh``).
     """
@@ -201,6 +201,7 @@ class _Stream:
     sent: list[bytes] = field(default_factory=list)
     back: bool = False
     gone: bool = False
+    failed: bool = False
     decoded: deque[bytes] = field(default_factory=deque)
     recorded: deque[Row] = field(default_factory=deque)
     since: bytearray = field(default_factory=bytearray)
@@ -277,7 +278,8 @@ class _Verifier:
     def _on_wire(self, role: str, way: str, t: float, data: bytes) -> None:
         """Everything read in a poll was read before anything was sent in it."""
         stream = self._streams[role]
-        if not stream.counted and (t != stream.t or (way in ("rx", "back") and stream.sent)):
+        over = stream.failed or t != stream.t or (way in ("rx", "back") and stream.sent)
+        if over and not stream.counted:
             self._poll(role)
         stream.t = t
         match way:
@@ -289,11 +291,13 @@ class _Verifier:
                 stream.back = True
             case "gone":
                 stream.gone = True
+            case "failed":
+                stream.failed = True
 
     def _poll(self, role: str) -> None:
         """Let today's driver do what was done in the poll that has been gathered."""
         stream = self._streams[role]
-        if not (stream.arrived or stream.sent or stream.back or stream.gone):
+        if not (stream.arrived or stream.sent or stream.back or stream.gone or stream.failed):
             return
         wire = self._desk.wires[role]
         self._arrive(stream)
@@ -301,7 +305,7 @@ class _Verifier:
         wire.gone = wire.gone and not stream.back
         if stream.gone:  # found so by the last request, or else by reading
             wire.gone, wire.takes = not stream.sent, len(stream.sent) - 1 if stream.sent else None
-        stream.back = stream.gone = False
+        failed, stream.back, stream.gone, stream.failed = stream.failed, False, False, False
         device = self._bench.devices[role]
         if isinstance(device, Renewed):  # the guard called it all the time
             device.renew()
@@ -310,8 +314,9 @@ class _Verifier:
                 samples = device.poll(stream.t)
                 break
             except DeviceError as error:
-                # The recorded poll ended with it, unless more was asked: then a poll that left no trace had raised it.
-                if wire.sent == stream.sent or str(error) == stream.error:
+                # The recorded poll ended with it. An older log does not say so: there, a poll that left no trace had
+                # raised it if more was asked.
+                if failed or wire.sent == stream.sent or str(error) == stream.error:
                     samples = []
                     break
                 stream.error = str(error)

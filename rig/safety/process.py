@@ -247,8 +247,10 @@ class Server:
         self._polled_at = self._clock.now()  # all the time that the driver knows: what passes on its wire bears it
         try:
             samples = supply.poll(self._polled_at)
-        except DeviceLost:
-            self._find_again()
+        except DeviceError as error:
+            self._tell_wire(ROLE, "failed", b"", self._polled_at)
+            if isinstance(error, DeviceLost):
+                self._find_again()
             raise
         for raw in samples:
             assert isinstance(raw, HVSample)

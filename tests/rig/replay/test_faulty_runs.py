@@ -49,6 +49,8 @@ def test_it_comes_out_the_same(
     told = [row.topic.split("/") for row in recording.rows if row.topic.endswith(("/gone", "/back"))]
     assert {way: sum(one[-1] == way for one in told) for way in links} == links
     assert all(one[2] == role for one in told)
+    if kind in ("silent", "reset"):  # what is lost tells it by its link
+        assert any(row.topic == f"/raw/{role}/failed" for row in recording.rows)
     verified = verify(recording)
     assert verified.exit_code == 0, verified.report
     again = rerun(recording)
