@@ -28,6 +28,8 @@ from model.material.materials import Material
 from model.membrane.solve import solve_many
 from model.specimen import Specimen
 from rig.analysis import proposal
+from rig.benchmark import fit_histories
+from rig.benchmark.fit_histories import Histories
 from rig.protocol.experiment import certificates_of
 from rig.protocol.protocol import Protocol
 from rig.scene.scene import Scene, load_scene
@@ -77,17 +79,19 @@ class Report:
     full: bool
     points: list[Point]
     rig: list[RigPoint]
+    histories: Histories
     swept: int = SWEPT
 
 
 def run(full: bool, out_dir: Path, progress: Progress = lambda share, what: None) -> Report:
-    """Measure (half a minute; full: some minutes); write ``fit.json``, ``fit.csv`` and ``fit.png``."""
+    """Measure (a minute; full: some minutes); write ``fit.json``, ``fit.csv`` and ``fit.png``."""
     report = measure(
         samples=(10, 100, 1000, 10_000, 100_000) if full else (10, 100, 1000, 10_000),
         every=(10, 30, 100, 300) if full else (10, 30, 100),
         repeats=5 if full else 2,
         minutes=(3.0, 5.0, 10.0, 20.0, 60.0) if full else (3.0, 5.0, 10.0),
         runs=40 if full else 8,
+        histories=((1e-2, 1e-3, 1e-4), (1e-2, 1e-3, 1e-4), (1e-2, 1e-3)) if full else ((1e-2, 1e-3, 1e-4), (1e-3,), ()),
         full=full,
         progress=progress,
     )
@@ -102,11 +106,15 @@ def measure(
     repeats: int,
     minutes: Sequence[float],
     runs: int,
+    histories: tuple[Sequence[float], Sequence[float], Sequence[float]],
     tolerances: Sequence[float] = TOLERANCES,
     full: bool = False,
     progress: Progress = lambda share, what: None,
 ) -> Report:
-    """Fits of ``samples`` a curve (``every``: without reduction), and ``runs`` experiments for each of ``minutes``."""
+    """Fits of ``samples`` a curve (``every``: without reduction), and ``runs`` experiments for each of ``minutes``.
+
+    ``histories`` are the tolerances of each method of `fit_histories.measure`.
+    """
     points = []
     curves = _curves(SWEPT, zeros=True)
     reference = _fit(_Reduced(curves, 1e-10, nodes=20), analytic=True)[0]
@@ -121,7 +129,9 @@ def measure(
         points.append(_point(REDUCED, _Reduced, some, 1e-7, truth, analytic=True, repeats=repeats))
         if count in every:
             points.append(_point(EVERY, _EverySample, some, 1e-7, truth, analytic=True, repeats=1))
-    return Report(full, points, _on_the_rig(minutes, runs, lambda share, what: progress(0.5 + 0.5 * share, what)))
+    rig = _on_the_rig(minutes, runs, lambda share, what: progress(0.5 + 0.3 * share, what))
+    progress(0.8, "films that take time")
+    return Report(full, points, rig, fit_histories.measure(*histories))
 
 
 def simulated(
@@ -348,6 +358,10 @@ def save(report: Report, out_dir: Path) -> None:
             writer.writerow([*row, *(point.error[name] for name in QUANTITIES)])
         for one in report.rig:
             writer.writerow([one.protocol, "", "", "", "", one.duration, *(one.error[name] for name in QUANTITIES)])
+        for fitted in report.histories.rows:
+            label = f"film that takes time, {fitted.method}"
+            errors = [fitted.error.get(name, "") for name in QUANTITIES]
+            writer.writerow([label, fitted.tolerance, "", fitted.seconds, fitted.histories, "", *errors])
     plot.fits(report, out_dir / "fit.png")
 
 
@@ -368,4 +382,4 @@ def render(report: Report) -> RenderableType:
     for one in report.rig:
         cells = (f"{100 * one.error[name]:.2g} ({100 * one.stated[name]:.2g})" for name in QUANTITIES)
         rig.add_row(one.protocol, f"{one.duration / 60:.1f}", str(one.runs), *cells)
-    return Group(fits, rig)
+    return Group(fits, fit_histories.table(report.histories), rig)

@@ -199,6 +199,24 @@ def _decades(values: list[float]) -> tuple[float, float]:
     return 10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values) * 1.01))
 
 
+def _histories(axes: Axes, report: Fits) -> None:
+    """Fits of a film that takes time: the largest error, over what noise leaves uncertain, against their time."""
+    stated = report.histories.stated
+    looks = zip(
+        dict.fromkeys(row.method for row in report.histories.rows), (BLACK, SKY, VERMILLION), "o^s", strict=False
+    )
+    for method, colour, marker in looks:
+        mine = [row for row in report.histories.rows if row.method == method]
+        errors = [max(row.error[name] / one for name, one in stated.items()) for row in mine]
+        axes.plot([row.seconds for row in mine], errors, color=colour, marker=marker, label=method)
+    axes.set(xscale="log", yscale="log", title="A film that takes time", xlabel="time of a fit / s")
+    axes.set_ylabel("largest error / uncertainty by noise")
+    axes.set_xlim(*_decades([row.seconds for row in report.histories.rows]))
+    axes.set_ylim(1e-3, 1.0)
+    axes.legend(frameon=False, fontsize=8)
+    _tidy(axes)
+
+
 def fits(report: Fits, path: Path) -> None:
     """Error of the film against compute time, compute time against samples, error against the time of the rig."""
     figure, panels = _figure(15.0, 7.4, 2, 4)
@@ -245,8 +263,8 @@ def fits(report: Fits, path: Path) -> None:
         axes.set_xticks([], minor=True)
         _tidy(axes)
     panels[1][0].set_ylabel("error / %, noise and zeros")
-    panels[1][3].axis("off")
-    panels[1][3].legend(*panels[1][0].get_legend_handles_labels(), loc="center left", frameon=False)
+    panels[1][0].legend(frameon=False, fontsize=8)
+    _histories(panels[1][3], report)
     runs = report.rig[0].runs if report.rig else 0
     figure.suptitle(
         f"Error of the identified film against time: on the computer, and on the rig ({runs} experiments each)"

@@ -86,8 +86,16 @@ State = tuple[Correction, list[Around], NDArray[np.bool_], NDArray[np.bool_]]
 class Joint:
     """All records of one film, with a number of branches."""
 
-    def __init__(self, records: Sequence[Record], start: Material, terms: int, held: Sequence[str] = ()) -> None:
-        self.records = records
+    def __init__(
+        self,
+        records: Sequence[Record],
+        start: Material,
+        terms: int,
+        held: Sequence[str] = (),
+        *,
+        tolerance: float = TOLERANCE,
+    ) -> None:
+        self.records, self.tolerance = records, tolerance
         self.held = tuple(held)
         electric = any(record.history[2].max() > 0.0 for record in records) and "eps_r" not in held
         self.coordinates = Coordinates.of(start, terms, electric)
@@ -329,7 +337,7 @@ class Joint:
         self.solved += 1
         specimens = [one.film(film) for one in self.responses]
         histories = [(one.t, one.h, one.voltage, at) for one, at in zip(self.responses, times, strict=True)]
-        return solve_histories(specimens, histories, tolerance=TOLERANCE, sensitivities=sensitivities)
+        return solve_histories(specimens, histories, tolerance=self.tolerance, sensitivities=sensitivities)
 
     def softening(self, x: Array, record: Record, times: Array) -> Array:
         """Share of the force that the film has lost by the cycles before, at times (s) of a record."""
