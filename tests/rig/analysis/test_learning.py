@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from calibration.film.identify import Identification
+from calibration.film.result import Identification
 from rig.analysis.learning import HOPELESS, Learner
 from rig.scene.scene import load_scene
 from rig.steps.advisor import Advice, Ask, Kind
