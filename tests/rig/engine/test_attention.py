@@ -85,8 +85,8 @@ def test_an_answer_wakes_the_loop_but_not_before_the_shortest_turn(devices: dict
     due, awaited = attention.next()
     assert due == math.inf and awaited == [devices["stage"].mine.fileno()]
     timer = threading.Timer(SOON, devices["stage"].other.send, [b"answer"])
+    began = clock.now()  # before the timer: a busy machine may hold this thread up between the two
     timer.start()
-    began = clock.now()
     attention.wait(began, began + LATE, awaited)
     assert 0.9 * SOON <= clock.now() - began < LATE  # no answer, no waking; an answer, no waiting
     timer.join()
