@@ -158,7 +158,9 @@ def left_out(problem: Problem, point: Fitted) -> LeftOut:
         total += float(there @ there)
         freedom = max(1, int(out.sum()) - (rank - known))
         found.append((freedom, max(0.0, whole - rest)))
-    return LeftOut.judged(math.sqrt(total / int(kept.sum())), found)
+    # A few numbers, as those next to where a film hangs slack, do not tell of another law.
+    telling = [one for one in found if one[0] >= rank]
+    return LeftOut.judged(math.sqrt(total / int(kept.sum())), telling or found)
 
 
 def _least(columns: Array, residual: Array) -> tuple[Array, int, float]:
