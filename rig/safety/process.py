@@ -247,10 +247,11 @@ class Server:
         self._polled_at = self._clock.now()  # all the time that the driver knows: what passes on its wire bears it
         try:
             samples = supply.poll(self._polled_at)
-        except DeviceError as error:
+        except DeviceLost:
+            self._find_again()
+            raise
+        except DeviceError:
             self._tell_wire(ROLE, "failed", b"", self._polled_at)
-            if isinstance(error, DeviceLost):
-                self._find_again()
             raise
         for raw in samples:
             assert isinstance(raw, HVSample)

@@ -67,6 +67,17 @@ def test_on_a_bench_in_memory_all_are_polled_in_every_turn(devices: dict[str, In
         assert list(attention.wanted(now)) == ["stage", "force"]
 
 
+def test_where_a_descriptor_was_closed_all_are_polled(devices: dict[str, Instrument]) -> None:
+    """A port that was lost and opened again has another one."""
+    attention, _ = attention_of(devices)
+    for role, device in devices.items():
+        attention.polled(role, 1.0)
+        device.next_poll = math.inf
+    assert attention.wanted(1.005) == []
+    devices["stage"].mine.close()
+    assert list(attention.wanted(1.0051)) == ["stage", "force"]
+
+
 def test_who_awaits_an_answer_is_polled_when_it_has_come_and_not_before(devices: dict[str, Instrument]) -> None:
     attention, _ = attention_of(devices)
     for role in devices:
