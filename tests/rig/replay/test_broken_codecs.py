@@ -164,6 +164,9 @@ class ByteOrder:
     def unpack_from(self, layout, data, offset=0):
         return struct.unpack_from(self._swap(layout), data, offset)
 
+    def Struct(self, layout):  # the module's own name
+        return struct.Struct(self._swap(layout))
+
 
 CASES = [
     ("stage", "paper", zaber_sign),
