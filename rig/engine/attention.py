@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import select
+from collections import Counter
 from collections.abc import Sequence
 
 from drivers.dialogue import LOOK_AGAIN_S
@@ -27,8 +28,10 @@ class Attention:
         self._all = list(bench.devices)
         self._descriptors = {role: found for role in self._all if (found := bench.descriptor(role)) is not None}
         self._polled = dict.fromkeys(self._all, -math.inf)
-        self._links = {role: one for role, one in self._descriptors.items() if bench.has_link(role)}
-        self._shared = len(set(self._descriptors.values())) < len(self._descriptors)
+        users = Counter(self._descriptors.values())
+        self._shared = any(count > 1 for count in users.values())
+        # An answer on a connection of several may have been read already, by another of them.
+        self._links = {role: one for role, one in self._descriptors.items() if bench.has_link(role) and users[one] == 1}
         self._watched = sorted(set(self._descriptors.values()))
 
     def wanted(self, now: float) -> Sequence[str]:

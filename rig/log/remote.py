@@ -185,6 +185,7 @@ class RemoteLog:
     def _drain(self) -> None:
         """Wait until the writer has taken everything."""
         clock = RealClock()
+        self._end_frame()
         while self._waiting:
             self._send()
             self._listen()

@@ -299,7 +299,12 @@ class Server:
             watched: list[Channel | int] = [self._channel]
             if awaits and self._descriptor is not None:
                 watched.append(self._descriptor)
-            readable, _, _ = select.select(watched, [], [], wait)
+            try:
+                readable, _, _ = select.select(watched, [], [], wait)
+            except (OSError, ValueError):  # the link was closed, and says so when it is read
+                self._descriptor, self._came = None, True
+                self._clock.sleep_until(now + wait)
+                return
             self._came |= self._descriptor in readable
 
     def _fault(self, error: BaseException) -> None:

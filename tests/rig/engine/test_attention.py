@@ -67,6 +67,22 @@ def test_on_a_bench_in_memory_all_are_polled_in_every_turn(devices: dict[str, In
         assert list(attention.wanted(now)) == ["stage", "force"]
 
 
+def test_an_answer_that_another_one_has_read_is_looked_for_when_its_instrument_wishes(
+    devices: dict[str, Instrument],
+) -> None:
+    """Two on one connection: the system knows of nothing any more."""
+    devices["force"].mine.close()
+    devices["force"].mine = devices["stage"].mine
+    attention, _ = attention_of(devices)
+    for role, device in devices.items():
+        attention.polled(role, 1.0)
+        device.next_poll = 1.0 + LOOK_AGAIN_S
+    assert attention.wanted(1.0 + 0.5 * LOOK_AGAIN_S) == []
+    due, awaited = attention.next()
+    assert due == 1.0 + LOOK_AGAIN_S and awaited == []
+    assert list(attention.wanted(due)) == ["stage", "force"]
+
+
 def test_where_a_descriptor_was_closed_all_are_polled(devices: dict[str, Instrument]) -> None:
     """A port that was lost and opened again has another one."""
     attention, _ = attention_of(devices)

@@ -281,3 +281,15 @@ def test_what_a_producer_sends_is_checked_by_the_writer(tmp_path):
     found = read_log(tmp_path / "a.mcap")
     assert found.whole and found.topics == {"/force/sample": 50}
     assert found.metadata["note"] == {"a": "b"}
+
+
+def test_what_was_written_last_is_with_the_writer_when_the_log_is_closed(tmp_path):
+    """The guard's last word, told after its last turn."""
+    ours, writers = socket.socketpair()
+    with writers:
+        log = RemoteLog(tmp_path / "run.mcap", ours)
+        fields = {"t_s": 1.0, "severity": "warning", "source": "guard", "message": "the last word"}
+        log.write("/event", fields, 10**18, 10**18)
+        log.close()
+        arrived = writers.recv(65536)
+    assert b"the last word" in arrived
