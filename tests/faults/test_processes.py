@@ -293,7 +293,7 @@ def test_an_adapter_that_is_pulled_and_comes_back_is_found_again_and_the_output_
     assert "is open again" in "".join(m.fields["message"] for m in log.messages("/event"))
 
 
-@pytest.mark.parametrize("first", ["guard killed", pytest.param("pulled", marks=pytest.mark.long)])
+@pytest.mark.parametrize("first", ["guard killed", "pulled"])
 def test_a_guard_killed_while_the_adapter_is_out_leaves_the_engine_to_take_the_output_off(
     stand: Stand, live: Run, first: str
 ) -> None:

@@ -86,6 +86,7 @@ def test_a_second_reading_that_dies_prevents_no_off_but_nobody_calls_it_safe(sta
     stand.do(lambda bench: setattr(bench.wire("monitor"), "upset_from_device", None))
 
 
+@pytest.mark.parametrize("stand", METERS, indirect=True)  # a meter that sends by itself: once in CI
 def test_an_engine_that_is_killed_leaves_the_monitor_to_the_guard(stand: Stand, live: Run) -> None:
     at = stand.kill(live.engine)
     stand.wait(lambda: stand.off_after(at) is not None, "the output's end")

@@ -134,7 +134,7 @@ def test_the_terminal_is_closed(terminal: Terminal) -> None:
     check_off(terminal, at, log)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.long)])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_signal_from_outside(terminal: Terminal, number: signal.Signals) -> None:
     at = terminal.stand.bench.clock.now()
     terminal.process.send_signal(number)

@@ -183,9 +183,8 @@ def off_within(running: Running, sent: int) -> float:
     return took
 
 
-@pytest.mark.parametrize(
-    "sent", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.long)], ids=["killed", "stopped"]
-)
+# A killed process lets go of its connection, which a device could notice; a stopped one keeps it open and silent.
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 def test_the_output_goes_off_without_any_of_our_processes(running: Running, sent: int) -> None:
     took = off_within(running, sent)
     assert took > 0.5  # nobody else took it off

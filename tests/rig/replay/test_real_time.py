@@ -41,7 +41,7 @@ def served(scene, folder):
             bench.wait(20)
 
 
-@pytest.fixture(scope="module", params=[pytest.param("no-hv", marks=pytest.mark.long), "no-laser"])
+@pytest.fixture(scope="module", params=["no-hv", "no-laser"])
 def real(request, tmp_path_factory):
     """A fixture's run in real time: one without high voltage, and one with a guard in a process of its own."""
     for _ in range(3):  # a machine that holds up the engine for longer than the guard bears ends a run, as it should

@@ -98,7 +98,7 @@ def test_without_arm_there_is_no_high_voltage_and_no_log(scene: Path, ports: Pat
 
 
 @pytest.mark.slow
-# Those that a terminal sends are also in `tests/faults/test_terminal.py`.
+# The others in CI: `tests/faults/test_terminal.py`, SIGINT there by its key.
 @pytest.mark.parametrize(
     "number",
     [
