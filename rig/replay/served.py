@@ -3,7 +3,8 @@
 How often an instrument is asked for its value between two commands is then left to chance. So a request is answered by
 its like in the log: a question that the log repeats all the time by that which was asked nearest to the same time since
 the last command. Everything else, commands above all, must come as it came then, in the same order. Only motions, which
-follow from readings, are given some play: their places by a few steps, and one replaced at once may be missing.
+follow from readings, are given some play: their places by a few steps, and one replaced at once may be missing, or be
+made where the log has none.
 """
 
 from __future__ import annotations
@@ -107,8 +108,15 @@ class ServedScript:
                 self._lag.s = t - exchange.request.t
                 return exchange
             if exchange.key not in self._repeated and not self._replaced_at_once(n):
-                break
+                return self._to_be_replaced(key, exchange, t)
         return None
+
+    def _to_be_replaced(self, key: bytes, coming: Exchange, t: float) -> Exchange | None:
+        """For a motion that the log does not have, since it would have been replaced at once: the newest one it has."""
+        if abs(coming.request.t + self._lag.s - t) > AT_ONCE_S or not self._dialect.replaces(key, coming.key):
+            return None
+        before = (one for one in reversed(self._exchanges[: self._next]) if one.key not in self._repeated)
+        return next((one for one in before if self._dialect.replaces(one.key, coming.key)), None)
 
     def _replaced_at_once(self, n: int) -> bool:
         now = self._exchanges[n]

@@ -91,6 +91,22 @@ def test_a_motion_may_be_missing_that_was_stopped_at_once(later, missed):
             one.write(encode(1, 1, 7, "stop"), 3.0)
 
 
+@pytest.mark.parametrize(("early", "taken"), [(0.03, True), (0.3, False)])
+def test_a_motion_may_be_made_that_would_have_been_stopped_at_once(early, taken):
+    """Then the reading that stopped it came just before it was made; now, just after."""
+    rows = zaber(POSITIONS, "move abs 5")[:-3]
+    t = rows[-1][0] + 1.0
+    rows += [(t, True, encode(1, 1, 90, "stop")), (t + 0.01, False, b"@01 1 90 OK BUSY -- 1\r\n")]
+    one = script(rows)
+    assert ask(one, 3.0, 7, "move abs 5") == 0
+    if not taken:
+        with pytest.raises(Departed, match="move abs 500"):
+            one.write(encode(1, 1, 8, "move abs 500"), t - early)
+        return
+    assert ask(one, t - early, 8, "move abs 500") == 0  # as the motion before it was answered
+    assert ask(one, t, 9, "stop") == 1
+
+
 def test_a_command_may_come_before_its_time_but_not_twice():
     one = script(zaber(POSITIONS, "move abs 5"))
     ask(one, 0.5, 3, "move abs 5")
