@@ -43,6 +43,8 @@ AIM = 0.99  # times the uncertainty that is wanted: a hold that ends just short 
 LEAST_ROOM = 0.9  # what stays counts at most as so much of a wish, in a plan
 TRUST = 4.0  # by what factor a variance that a fit claims may move what is planned
 HOPELESS = 3  # fits in a row that say that it cannot be reached
+NOTICED = 0.01  # of a variance: what time at the present voltage has to take off it, where it allows no other
+OUT = "the time is out"
 MET_WORDS = "known well enough, and so said the fit before"
 FIRST_STRETCH = 1.25  # times the pre-stretch: where the stiffness is wanted before there is a fit
 
@@ -88,15 +90,17 @@ class Learner:
             kind, words = (Kind.UNREACHABLE, lost[0].reason) if lost else (Kind.MET, MET_WORDS)
             return replace(told, kind=kind, reason=words)
         if question.left_s <= TURN_S:
-            return replace(told, kind=Kind.TIME, reason="the time is out")
+            return replace(told, kind=Kind.TIME, reason=OUT)
         missing = [one.quantity for one in open_ if one.relative > one.wanted]
         if not missing:
             seconds = min(max(CONFIRM * question.spent_s, CONFIRM_S[0]), CONFIRM_S[1])
+            h, voltage = self._nearest(question)
             reason = "known well enough; confirmed by new data"
-            return replace(told, reason=reason, h=question.h, voltage=question.voltage, hold_s=seconds, expected_s=0.0)
+            return replace(told, reason=reason, h=h, voltage=voltage, hold_s=seconds, expected_s=0.0)
         after = self._next(curves, found, question, stands, missing, "least time to what is wanted")
         return replace(
             told,
+            kind=after.kind,
             reason=after.reason,
             h=after.h,
             voltage=after.voltage,
@@ -158,7 +162,7 @@ class Learner:
         missing: Sequence[str],
         reason: str,
     ) -> Advice:
-        """The beginning of the best plan for what is ``missing``."""
+        """The beginning of the best plan for what is ``missing``; that the time is out where it allows none."""
         specimen, stretch = self._specimen, (FIRST_STRETCH * self._specimen.prestretch, self._specimen.prestretch)
         if found is not None:
             specimen, stretch = specimen.with_material(found.material), found.stretch
@@ -166,8 +170,12 @@ class Learner:
         held = self._seconds(places, curves)
         known = places.prior + (places.rows * held[:, None]).T @ places.rows
         target = self._targets(places, known, stands, missing)
-        plan = min((self._plan(places, known, target, levels, question) for levels in self._sets(places, question)),
-                   key=lambda one: (one.excess, one.total))  # fmt: skip
+        allowed = [(one, self._way(one, question)) for one in self._sets(places, question)]
+        allowed = [(one, way) for one, way in allowed if self._rest(way, question) >= TURN_S + LEAST_S]
+        plans = [self._plan(places, known, target, levels, way, question) for levels, way in allowed]
+        plan = min(plans, key=lambda one: (one.excess, one.total), default=None)
+        if plan is None or (len(plans) == 1 and not _tells(places, known, target, plan)):
+            return Advice(Kind.TIME, OUT)
         h, voltage, seconds = _begin(places, plan.seconds, held, question)
         seconds = min(seconds, max(FIRST_S, float(held.sum())))
         return Advice(Kind.GO, reason, h, voltage, max(seconds - TURN_S, LEAST_S), expected_s=plan.total)
@@ -198,18 +206,37 @@ class Learner:
         sets = {frozenset(one) for v in levels for one in ((here,), (v,), (here, v), (0.0, v), (here, 0.0, v))}
         return sorted(tuple(sorted(one)) for one in sets)
 
-    def _plan(self, places: Places, known: Array, target: Array, levels: tuple[float, ...], question: Ask) -> _Plan:
-        """The best plan with these voltages, the way back to 0 V in its time."""
-        ramp = self.scene.hv.ramp_V_per_s if self.scene.hv is not None else math.inf
+    def _way(self, levels: tuple[float, ...], question: Ask) -> float:
+        """Seconds of the ways between these voltages, from the present one on, and back to 0 V."""
         way, at = 0.0, question.voltage
         here = [one for one in levels if abs(one - at) < 1.0]
         for level in [*here, *sorted(set(levels) - set(here), reverse=True), 0.0]:
-            way += abs(level - at) / ramp + self.settle_s * (level != at)
+            way += self._change(at, level)
             at = level
+        return way
+
+    def _change(self, before: float, after: float) -> float:
+        """Seconds of a change of the voltage."""
+        ramp = self.scene.hv.ramp_V_per_s if self.scene.hv is not None else math.inf
+        return abs(after - before) / ramp + self.settle_s * (after != before)
+
+    def _rest(self, way: float, question: Ask) -> float:
+        """Seconds that the ways leave; that back from here is taken off what is left already."""
+        return question.left_s - (way - self._change(question.voltage, 0.0))
+
+    def _plan(
+        self, places: Places, known: Array, target: Array, levels: tuple[float, ...], way: float, question: Ask
+    ) -> _Plan:
+        """The best plan with these voltages, the way back to 0 V in its time."""
         these = np.flatnonzero(np.isin(places.voltage, levels)).tolist()
-        longest = max(question.left_s - way, FIRST_S)
-        excess, seconds = least_time(places, known, target, these, longest)
+        excess, seconds = least_time(places, known, target, these, self._rest(way, question))
         return _Plan(max(excess, 1.0), float(seconds.sum()) + way, seconds)
+
+    def _nearest(self, question: Ask) -> tuple[float, float]:
+        """The place nearest to where the film is held: a pause may have left it between two."""
+        here = np.flatnonzero(np.abs(self.voltage - question.voltage) == np.abs(self.voltage - question.voltage).min())
+        k = here[np.abs(self.h[here] - question.h).argmin()]
+        return float(self.h[k]), float(self.voltage[k])
 
     def _places(self, curves: Sequence[Curve], specimen: Specimen, stretch: tuple[float, float]) -> Places:
         return Places(specimen, self.h, self.voltage, self.scene.rates["force"], curves[0], stretch)
@@ -233,6 +260,15 @@ class _Plan:
     excess: float
     total: float
     seconds: Array
+
+
+def _tells(places: Places, known: Array, target: Array, plan: _Plan) -> bool:
+    """Whether a plan reaches what is wanted, or makes a variance of it noticeably smaller."""
+    after = known + (places.rows * plan.seconds[:, None]).T @ places.rows
+    before, then = (
+        np.einsum("jp,pj->j", places.wanted, np.linalg.solve(one, places.wanted.T)) for one in (known, after)
+    )
+    return plan.excess <= 1.0 or bool((then < (1.0 - NOTICED) * before)[np.isfinite(target)].any())
 
 
 def _begin(places: Places, seconds: Array, held: Array, question: Ask) -> tuple[float, float, float]:

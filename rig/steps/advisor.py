@@ -16,7 +16,9 @@ class Kind(StrEnum):
     MET = "met"  # all that was wanted is reached
     UNREACHABLE = "unreachable"  # what no time makes smaller is more than was wanted; the rest is reached
     TIME = "time"  # the time is out; of one quantity: it needs more time
-    FAILED = "failed"  # no advice: the fit failed, or its process ended or took too long
+    FAILED = (
+        "failed"  # no advice: the fit failed, or its process ended or took too long; of one quantity: that ended it
+    )
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,14 @@ from rig.steps.wanted import EXAMPLE, Wanted, parse_wanted
 LEAST_TIME_S = 60.0
 ANSWER_S = 60.0  # a fit that takes longer is given up
 FAILURES = 3  # fits in a row that fail: then the step ends, in order
-ENDS = {Kind.MET: "met", Kind.UNREACHABLE: "unreachable", Kind.TIME: "needs more time"}  # of one wish, for people
+ENDS = {  # of one wish, for people
+    Kind.MET: "met",
+    Kind.UNREACHABLE: "unreachable",
+    Kind.TIME: "needs more time",
+    Kind.FAILED: "the fits failed",
+}
 HOLD_ANYWAY_S = 10.0  # where the film is, after a fit that failed
+LEAST_HOLD_S = 1.0  # at a place that is gone to
 
 
 class Learn(Step):
@@ -149,7 +155,7 @@ class _Loop:
         self._began = rig.clock.now()
         self._before = before.reference
         self.number = before.count
-        self._failures = 0
+        self._failures = 0  # in a row, the newest fit the last of them
         self._known: tuple[Standing, ...] = ()  # by the newest fit
         # Where the disk is: after a pause, somewhere at 0 V.
         measured = rig.recorder.displacement
@@ -166,29 +172,41 @@ class _Loop:
     @property
     def left(self) -> float:
         """What is left of them, the way back taken off."""
-        at = self._at
-        back = ramp_duration(self._rig.scene, at.voltage, 0.0) + self._action.by.settle_s
-        back += abs(at.h - self._action.h[0]) / self._action.speed_between
+        return self._left_at(self._at.h, self._at.voltage)
+
+    def _left_at(self, h: float, voltage: float) -> float:
+        """What is left of them but for the way back from this place."""
+        back = ramp_duration(self._rig.scene, voltage, 0.0) + self._action.by.settle_s
+        back += abs(h - self._action.h[0]) / self._action.speed_between
         return self._action.duration - self.spent - back
+
+    def _in_time(self, advice: Advice) -> bool:
+        """Whether there is time to do so, and for the way back afterwards."""
+        at = self._at
+        if advice.kind is not Kind.GO or (advice.h, advice.voltage) == (at.h, at.voltage):
+            return self.left > 0.0
+        way = abs(advice.h - at.h) / self._action.speed_between
+        if advice.voltage != at.voltage:
+            way += ramp_duration(self._rig.scene, at.voltage, advice.voltage) + self._action.by.settle_s
+        return self._left_at(advice.h, advice.voltage) - way >= LEAST_HOLD_S
 
     def run(self) -> Turns:
         if self.number == 0:
             yield from self._move(self._action.places[0.0][-1])
         while True:
             advice = yield from self._advised()
-            if self.left <= 0.0 and advice.kind in (Kind.GO, Kind.FAILED):
+            self._failures = self._failures + 1 if advice.kind is Kind.FAILED else 0
+            if advice.kind in (Kind.GO, Kind.FAILED) and not self._in_time(advice):
                 advice = _out_of_time(advice)
             self._tell(advice)
             if advice.kind is Kind.GO:
-                self._failures = 0
                 yield from self._go(advice)
                 yield from self._hold(min(advice.hold_s, self.left))
-            elif advice.kind is Kind.FAILED and self._failures + 1 < FAILURES:
-                self._failures += 1
+            elif advice.kind is Kind.FAILED and self._failures < FAILURES:
                 yield from self._hold(min(HOLD_ANYWAY_S, self.left))
             else:
                 break
-        self._result()
+        self._result(advice)
         yield from self._voltage(0.0)
         yield from self._move(self._action.h[0])
 
@@ -228,18 +246,24 @@ class _Loop:
         if advice.kind is Kind.FAILED:
             rig.recorder.event("warning", "fit", advice.reason)
 
-    def _result(self) -> None:
-        """All that was wanted, by the newest fit, in the order of the wish; NaN for what no fit has known yet."""
+    def _result(self, ending: Advice) -> None:
+        """All that was wanted, by the newest fit, in the order of the wish; NaN for what no fit has known yet.
+
+        What no fit has settled needs more time, unless the loop ended because fits failed.
+        """
         action, recorder = self._action, self._rig.recorder
         known = {one.quantity: one for one in self._known}
         for wish in action.by.wanted:
             one = known.get(wish.name)
-            outcome, value, error = (
-                (Kind.TIME, math.nan, math.nan) if one is None else (one.outcome, one.value, one.standard_uncertainty)
-            )
+            outcome, value, error = Kind.FAILED if self._failures else Kind.TIME, math.nan, math.nan
+            said = f"not known: {ENDS[Kind.FAILED]}" if self._failures else "not known yet"
+            if one is not None:
+                failed = ending.kind is Kind.FAILED and one.outcome is Kind.TIME
+                outcome, value, error = Kind.FAILED if failed else one.outcome, one.value, one.standard_uncertainty
+                why = ending.reason if failed else one.reason
+                said = f"{ENDS[outcome]} ({100 * one.relative:.3g} %; {why})"
             recorder.result(action.step, action.kind, str(outcome), wish.name, value, error, unit_of(wish.name))
             if len(action.by.wanted) > 1:
-                said = f"{ENDS[outcome]} ({100 * one.relative:.3g} %; {one.reason})" if one else "not known yet"
                 self._rig.control.say(f"  {wish}: {said}.")
 
     def _go(self, advice: Advice) -> Turns:
@@ -276,7 +300,7 @@ class _Loop:
 def _out_of_time(last: Advice) -> Advice:
     return Advice(
         Kind.TIME,
-        "the time is out",
+        f"the time is out; {last.reason}" if last.kind is Kind.FAILED else "the time is out",
         quantity=last.quantity,
         value=last.value,
         standard_uncertainty=last.standard_uncertainty,

@@ -140,7 +140,7 @@ def aicc(problem: Problem, point: Fitted, scale: float) -> float:
 
 
 def left_out(problem: Problem, point: Fitted) -> LeftOut:
-    """How a fit to the rest predicts each part of the records in turn (to first order)."""
+    """How a fit to the rest predicts each part of the records in turn (to first order); noise as the misfit has it."""
     columns = point.jacobian[:, free_columns(problem, point)]
     norms = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(norms > 0.0, norms, 1.0)
@@ -159,8 +159,8 @@ def left_out(problem: Problem, point: Fitted) -> LeftOut:
         freedom = max(1, int(out.sum()) - (rank - known))
         found.append((freedom, max(0.0, whole - rest)))
     # A few numbers, as those next to where a film hangs slack, do not tell of another law.
-    telling = [one for one in found if one[0] >= rank]
-    return LeftOut.judged(math.sqrt(total / int(kept.sum())), telling or found)
+    telling = [one for one in found if one[0] >= rank] or found
+    return LeftOut.judged(math.sqrt(total / int(kept.sum())), telling, misfit(problem, point))
 
 
 def _least(columns: Array, residual: Array) -> tuple[Array, int, float]:

@@ -100,14 +100,17 @@ class LeftOut:
     What a fit says of a part differs from it by the noise of that part and by the uncertainty of the fit: far more than
     noise where the rest hardly tells of it, as one of two rates of stretch does of the other. Against both together the
     squares of a part of n numbers sum up to chi-square of n degrees of freedom. For a linear model the sum is by how
-    much chi-square of the fit falls when the part is left out (Chow 1960).
+    much chi-square of the fit falls when the part is left out (Chow 1960). Noise is taken by the misfit of the fit, so
+    that one stated too small is no lack of the law; but no larger than half of the parts show it at least, as a part
+    that makes the misfit by itself would excuse itself.
 
     Attributes
     ----------
     noise : float
         Root mean square of all the differences over the noise alone, by which models are compared.
     expected : float
-        Of the part that is predicted worst: root mean square over what noise and uncertainty together give; near 1.
+        Of the part that is predicted worst: root mean square over what noise, as the misfit has it, and uncertainty
+        together give; near 1.
     chance : float
         Probability of as much by chance in any of the parts.
     """
@@ -117,12 +120,13 @@ class LeftOut:
     chance: float
 
     @classmethod
-    def judged(cls, noise: float, parts: Sequence[tuple[int, float]]) -> LeftOut:
+    def judged(cls, noise: float, parts: Sequence[tuple[int, float]], misfit: float) -> LeftOut:
         """From the degrees of freedom and the chi-square of every part; the worst one is the largest beyond chance."""
         from scipy.special import chdtrc
 
-        found = []
-        for freedom, square in parts:
+        usual = sorted(square / freedom for freedom, square in parts)[(len(parts) - 1) // 2]
+        scale, found = max(1.0, min(misfit, usual)), []
+        for freedom, square in ((freedom, square / scale) for freedom, square in parts):
             chance = min(1.0, len(parts) * float(chdtrc(freedom, square)))
             found.append((math.sqrt(square / freedom), chance))
         beyond = [one for one in found if one[1] < SIGNIFICANT]
@@ -246,8 +250,8 @@ class Spectrum:
         if self.branches and not self.counts[-1].left_out.explained:
             words.append(
                 f"a part of the record that was left out is predicted to {self.counts[-1].left_out.expected:.1f} times "
-                "what its noise and the uncertainty of the fit to the rest give: the film is not this law with these "
-                "branches, so that none counts as identified"
+                "what the noise, as most parts show it, and the uncertainty of the fit to the rest give: the film is "
+                "not this law with these branches, or that part was disturbed, so that none counts as identified"
             )
         if not self.branches:
             words.append("no branch is needed to explain this record")

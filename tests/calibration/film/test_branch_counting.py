@@ -60,8 +60,8 @@ TIME = np.linspace(0.0, 1.0, 100)
 COLUMNS = np.stack((np.exp(-TIME), TIME**2, np.maximum(TIME - 0.7, 0.0)), axis=1)  # the last part alone tells of one
 
 
-def judged(seed: int, wrong: Array | float = 0.0) -> LeftOut:
-    noise = np.random.default_rng(seed).standard_normal(TIME.size)
+def judged(seed: int, wrong: Array | float = 0.0, stated: float = 1.0) -> LeftOut:
+    noise = np.random.default_rng(seed).standard_normal(TIME.size) / stated
     made = Line(COLUMNS, STRETCHES, COLUMNS @ [300.0, 200.0, 500.0] + noise + wrong)
     return left_out(made, made)
 
@@ -79,6 +79,24 @@ def test_a_part_that_goes_another_way_is_not_explained() -> None:
     for seed in range(20):
         assert not judged(seed, bent).explained
         assert judged(seed, bent).expected > 2.0
+
+
+@pytest.mark.parametrize("stated", [0.6, 0.1])
+def test_noise_that_is_stated_too_small_is_no_lack_of_the_law(stated: float) -> None:
+    assert sum(not judged(seed, stated=stated).explained for seed in range(20)) <= 1
+
+
+def test_a_part_that_goes_another_way_is_not_excused_by_noise_that_is_stated_too_small() -> None:
+    bent = np.where(STRETCHES == 1, 10.0 * np.sin(40.0 * TIME), 0.0)
+    for seed in range(10):
+        assert not judged(seed, bent, stated=0.6).explained
+
+
+def test_several_parts_that_go_another_way_do_not_excuse_each_other() -> None:
+    squares = [(50, 50.0 * one) for one in (9.0, 1.1, 0.9, 8.0, 1.0, 1.2, 9.5, 1.0)]
+    found = LeftOut.judged(2.0, squares, misfit=30.0)
+    assert not found.explained
+    assert found.expected > 2.5
 
 
 WINDOW = (0.02, 200.0)

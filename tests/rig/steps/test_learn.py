@@ -10,6 +10,7 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from rig.scene.scene import load_scene
 from rig.steps.advisor import Advice, Ask, Kind, Standing
 from rig.steps.learn import FAILURES, Learning
 from rig.steps.places import connected
+from rig.steps.rig import CyclesDone
 from rig.steps.wanted import BY_TIME, STATED, Counts, parse_wanted
 
 SCENE = Path(str(files("sim_fixtures"))) / "scenes" / "cone-4mm.toml"
@@ -166,6 +168,66 @@ def test_all_places_and_ways_are_held_against_the_limits_before(places: dict[flo
         assert set(places[above]) <= set(places[below])
 
 
+# --- How it ends, with a rig that stands still
+
+
+class Still:
+    """A rig at 0 V that is held where it is; each look at its clock takes a quarter of a second."""
+
+    def __init__(self, experiment: Experiment, says: Iterable[Advice], at_most_s: float = 600.0) -> None:
+        (action,) = [one for one in experiment.actions if isinstance(one, Learning)]
+        h = action.places[0.0][0]
+        rig = MagicMock(scene=experiment.scene, advisor=Scripted(says), counts={})
+        rig.recorder.displacement = h
+        rig.clock.now.side_effect = itertools.count(0.0, 0.25)
+        for _ in replace(action, h=(h, h), duration=at_most_s, done=CyclesDone(1, 0.0)).carry_out(rig):
+            pass
+        calls = [one.args for one in rig.recorder.result.call_args_list]
+        self.outcomes = [(name, outcome) for _, _, outcome, name, *_ in calls]
+        self.decisions = [one.args[0]["outcome"] for one in rig.recorder.decision.call_args_list]
+
+
+BROKEN = Advice(Kind.FAILED, "the process has ended")
+
+
+def told(advice: Advice, **outcomes: Kind) -> Advice:
+    return replace(advice, known=tuple(replace(one, outcome=outcomes[one.quantity]) for one in advice.known))
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "eps_r", "ended"),
+    [
+        (Kind.TIME, Kind.TIME, ("failed", "failed")),
+        (Kind.MET, Kind.TIME, ("met", "failed")),
+        (Kind.TIME, Kind.UNREACHABLE, ("failed", "unreachable")),
+    ],
+)
+def test_what_no_fit_has_settled_has_failed_where_fits_that_fail_end_it(
+    experiment: Experiment,
+    places: dict[float, tuple[float, ...]],
+    stiffness: Kind,
+    eps_r: Kind,
+    ended: tuple[str, str],
+) -> None:
+    here = told(go(places[0.0][0], 0.0), stiffness=stiffness, eps_r=eps_r)
+    still = Still(experiment, [here, *[BROKEN] * FAILURES])
+    assert still.outcomes == [("stiffness", ended[0]), ("eps_r", ended[1])]
+
+
+def test_what_was_never_known_has_failed_and_what_a_later_fit_knows_needs_time(experiment: Experiment) -> None:
+    assert Still(experiment, [BROKEN] * FAILURES).outcomes == [("stiffness", "failed"), ("eps_r", "failed")]
+    assert Still(experiment, [BROKEN], at_most_s=1.0).outcomes == [("stiffness", "failed"), ("eps_r", "failed")]
+    later = told(ends(Kind.TIME), stiffness=Kind.TIME, eps_r=Kind.TIME)
+    assert Still(experiment, [BROKEN, BROKEN, later]).outcomes == [("stiffness", "time"), ("eps_r", "time")]
+
+
+def test_the_film_is_not_charged_where_the_ways_take_the_time_that_is_left(
+    experiment: Experiment, places: dict[float, tuple[float, ...]]
+) -> None:
+    high = max(places)
+    assert Still(experiment, [go(places[high][0], high)], at_most_s=10.0).decisions == ["time"]
+
+
 # --- What it does
 
 
@@ -216,8 +278,8 @@ def test_fits_that_keep_failing_end_the_step_in_order(experiment: Experiment, tm
     assert (log.outcome or {})["status"] == "complete"
     assert sum("the process has ended" in words for words in said) == FAILURES
     results = [message.fields for message in log.messages("/result")]  # nothing is known, and it says so
-    assert [(one["name"], one["outcome"]) for one in results] == [("stiffness", "time"), ("eps_r", "time")]
-    assert np.isnan([one["value"] for one in results]).all() and "eps_r 1 %: not known yet." in " ".join(said)
+    assert [(one["name"], one["outcome"]) for one in results] == [("stiffness", "failed"), ("eps_r", "failed")]
+    assert np.isnan([one["value"] for one in results]).all() and "eps_r 1 %: not known: the fits f" in " ".join(said)
     assert np.nanmax(np.abs(log.columns("/hv/sample")["voltage_V"])) < 60.0
 
 
