@@ -297,6 +297,7 @@ def test_no_profile_without_an_answer() -> None:
         solve(film(4, 1.0), 1e-3, 2500.0).profile()
 
 
+@pytest.mark.slow
 def test_the_least_hoop_stress_inside_the_film_converges_with_the_tolerance() -> None:
     """Its minimum is the polynomial's own, not that of a sample: the error falls to round-off, as the force's does."""
     treloar = NAMED["treloar-ogden1972"]

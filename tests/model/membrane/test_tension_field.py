@@ -205,6 +205,7 @@ def test_wrinkling_starts_where_tension_is_lost_and_ends_where_the_film_is_slack
     assert relaxed.force[answered][-1] < 0.1 * relaxed.force[0]
 
 
+@pytest.mark.slow
 def test_small_disk() -> None:
     small = Specimen(1e-4, 20e-3, 40e-6, 1.0, PARKER)
     v = np.array([1000.0])

@@ -47,8 +47,8 @@ def test_tension_vanishes_at_the_taut_limit() -> None:
 
 
 def test_breakdown_stands_beside_the_taut_limit() -> None:
-    limit = taut_limit(film(1.2), [8e-3, 12e-3])
-    there = solve_many(film(1.2), [8e-3, 12e-3], limit.breakdown_voltage, wrinkling="tension_field")
+    limit = taut_limit(film(1.2), [12e-3])
+    there = solve_many(film(1.2), [12e-3], limit.breakdown_voltage, wrinkling="tension_field")
     np.testing.assert_allclose(there.peak_field, 80e6, rtol=1e-6)
     assert np.isnan(taut_limit(SOFT, 4e-3).breakdown_voltage)
 
@@ -143,6 +143,7 @@ def test_small_steps_of_voltage_never_jump() -> None:
     assert np.all(np.diff(steps)[:-1] < 0.0)  # steeper and steeper
 
 
+@pytest.mark.slow
 def test_branch_in_displacement() -> None:
     branch = vary_displacement(film(1.2), 1000.0, 25e-3)
     assert branch.ended == "the end of the range"

@@ -182,6 +182,7 @@ def rig_with_stage(serial: int) -> Scene:
     return scene.model_copy(update={"simulation": scene.simulation.model_copy(update={"stage": stage})})
 
 
+@pytest.mark.slow
 def test_a_swapped_pair_of_stages_is_refused_before_either_moves(
     serve: Callable[[Scene], Served], tmp_path: Path
 ) -> None:
