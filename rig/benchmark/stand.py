@@ -43,7 +43,7 @@ title = "Live as soon as can be"
 do = "home"
 [[step]]
 do = "zero"
-duration_s = 0.2
+duration_s = 0.4
 [[step]]
 do = "approach"
 speed_mm_per_s = 4.0

@@ -38,7 +38,7 @@ do = "prompt"
 text = "Is the lid closed?"
 [[step]]
 do = "zero"
-duration_s = 0.2
+duration_s = 0.4
 """
 
 
