@@ -92,6 +92,7 @@ def test_every_breakdown_is_off_and_proven(tell: Tell, films: int) -> None:
                 truth,
             )
         story.log.unlink()
+        print(broken, flush=True)
 
 
 def test_a_film_that_bears_the_ceiling_is_censored_there_and_the_run_goes_on(tell: Tell) -> None:

@@ -46,7 +46,12 @@ from drivers.instruments.iseg_edcp.exchange import (
 )
 from drivers.instruments.iseg_edcp.protection import Protection
 from drivers.links.link import CanFrame, DeviceError, DeviceRefused, DeviceSilent, FrameLink
-from drivers.roles import HVSample, Identity
+from drivers.roles import HVFlag, HVSample, Identity
+
+# What a channel's own status says of an error of this channel; each of them also costs the module its "no sum error".
+CHANNEL_ERRORS = (
+    HVFlag.TRIPPED | HVFlag.ARC | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.VOLTAGE_LIMIT | HVFlag.CURRENT_LIMIT
+)
 
 T = TypeVar("T")
 
@@ -56,8 +61,10 @@ class IsegEDCP:
 
     Set-up registers the module and reads; it writes nothing else, so a channel that is found switched on stays as it
     is and shows in the samples. Each sample takes five reads at ``poll_rate_Hz`` (measured voltage and current,
-    set-point, channel status and events) and one of the module's status; they also keep the registration alive. If
-    the module has other channels, their status is read once a second into ``channel_status``.
+    set-point, channel status and events) and one of the module's status; they also keep the registration alive. Where
+    the module tells of an error in some channel that this one's status does not show, status and events are read once
+    more: an error between the two reads is this channel's own. If the module has other channels, their status is read
+    once a second into ``channel_status``.
 
     A command writes and reads back; a write that got lost is repeated, except switching on. A command that fails raises
     from ``poll`` and takes the commands queued behind it with it. ``emergency_off`` drops whatever is queued or under
@@ -446,6 +453,11 @@ class IsegEDCP:
         events = yield from self._integer(edcp.CHANNEL_EVENTS)
         module = yield from self._integer(edcp.MODULE_STATUS)
         flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module), self._bit_5)
+        if not module & ModuleStatus.NO_SUM_ERROR and not flags & CHANNEL_ERRORS:
+            # Some channel has an error. If it is this one, it came after its status was asked: a trip is no fault.
+            status = yield from self._integer(edcp.CHANNEL_STATUS)
+            events = yield from self._integer(edcp.CHANNEL_EVENTS)
+            flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module), self._bit_5)
         if self._sign < 0:  # with which sign a negative channel states them is not settled: magnitudes
             voltage, current, setpoint = abs(voltage), abs(current), abs(setpoint)
         self._samples.append(HVSample(t, voltage, current, setpoint, flags))

@@ -722,6 +722,42 @@ def test_the_other_channels_of_the_module_are_watched() -> None:
     assert frame("201# 60 00 00 07 00") in rig.module.sent
 
 
+class TripsBetween(Module):
+    """Its channel has an error just after status and events were asked for; the module's status tells of it."""
+
+    events = 0
+
+    def answer(self, key: bytes) -> None:
+        super().answer(key)
+        if key == b"\x40\x02\x00" and self.events:
+            self.set(edcp.CHANNEL_EVENTS, self.events)
+            self.set(edcp.MODULE_STATUS, GOOD & ~int(ModuleStatus.NO_SUM_ERROR | ModuleStatus.MODULE_GOOD))
+
+
+def test_a_trip_between_two_reads_is_told_as_one_and_not_as_a_fault_of_the_module() -> None:
+    module = TripsBetween()
+    rig = Rig(module).until_ready()
+    rig.run(0.5)
+    module.events = int(edcp.ChannelEvents.TRIP)
+    rig.run(0.5)
+    told = [sample.flags for sample in rig.samples if sample.flags]
+    assert told and all(flags & HVFlag.TRIPPED for flags in told), told
+
+
+def test_an_error_of_another_channel_stays_a_fault_and_one_of_the_module_needs_no_second_look() -> None:
+    rig = Rig(Module(channels=2)).until_ready()
+    rig.module.set(edcp.MODULE_STATUS, GOOD & ~int(ModuleStatus.NO_SUM_ERROR | ModuleStatus.MODULE_GOOD))
+    rig.run(0.5)
+    assert rig.samples[-1].flags == HVFlag.FAULT
+    rig.module.set(edcp.MODULE_STATUS, GOOD & ~int(ModuleStatus.TEMPERATURE_GOOD | ModuleStatus.MODULE_GOOD))
+    rig.run(0.5)
+    rig.module.sent.clear()
+    rig.run(1.0)
+    asked = [f.data for f in rig.module.sent]
+    assert rig.samples[-1].flags == HVFlag.FAULT
+    assert asked.count(b"\x40\x02\x00") <= asked.count(b"\x10\x00") + 1
+
+
 def found_again(module: Module) -> dict[bytes, bytes]:
     return {key: value for key, value in module.values.items() if key[0] in (0x10, 0x11, 0x40, 0x41)}
 
