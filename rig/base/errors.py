@@ -66,7 +66,10 @@ class StaleData(FaultError):
 
 
 class Breakdown(FaultError):
-    """The film has broken down: it draws more current than charges it and may leak, or the supply reports an arc."""
+    """The film has broken down: it draws more current than charges it and may leak, or the supply reports an arc.
+
+    Where the supply measures no current: its output has sagged, which a film that has broken down does to it.
+    """
 
     breakdown = True
 

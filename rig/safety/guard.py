@@ -505,26 +505,29 @@ class Guard:
     def _judge_deviation(self, sample: HVSample, before: HVSample | None) -> None:
         """The output must be on, and where the commanded ramp has it; two samples in a row that say no are a fault.
 
-        That the supply says of itself that it is ramping excuses nothing.
+        That the supply says of itself that it is ramping excuses nothing. Where no current is measured, a film that
+        breaks down shows in nothing but an output that sags.
         """
         on = HVFlag.ON in sample.flags
         self._seen_on = self._seen_on or on
         settled = on and not self._supply.busy and HVFlag.RAMPING not in sample.flags
-        problem = ""
+        problem, sagged = "", False
         if self._seen_on and not on:
             problem = "the supply says that it is off, and nobody switched it off from here"
         elif settled and not math.isclose(sample.setpoint, self.setpoint, rel_tol=1e-3, abs_tol=1.0):
             problem = f"its set-point is {sample.setpoint:.0f} V, and {self.setpoint:.0f} V were asked for from here"
         else:
-            problem = self._off_its_ramp(sample, before, settled=settled)
+            problem, sagged = self._off_its_ramp(sample, before, settled=settled)
         self._deviating_samples = self._deviating_samples + 1 if problem else 0
         if self._deviating_samples >= DEVIATION_SAMPLES:
+            if sagged and not self._supply.measures_current:
+                raise Breakdown(f"hv: {problem}. This supply measures no current: the film has probably broken down.")
             raise FaultError(f"hv: {problem}.")
 
-    def _off_its_ramp(self, sample: HVSample, before: HVSample | None, *, settled: bool) -> str:
-        """What is wrong with the voltage, held against the commanded ramp; empty if nothing is."""
+    def _off_its_ramp(self, sample: HVSample, before: HVSample | None, *, settled: bool) -> tuple[str, bool]:
+        """What is wrong with the voltage, held against the commanded ramp, and whether it sags; empty if nothing is."""
         if self._commanded is None:
-            return f"the output is at {sample.voltage:.0f} V, and it was never measured before it was commanded"
+            return f"the output is at {sample.voltage:.0f} V, and it was never measured before it was commanded", False
         self._commanded.confirm(sample.t, busy=self._supply.busy)
         least, most = self._commanded.band(sample.t)
         missing = abs(sample.voltage - self.setpoint)
@@ -533,12 +536,14 @@ class Guard:
         goes_away = heard and before is not None and missing > abs(before.voltage - self.setpoint) + AWAY_V
         inside = least <= sample.voltage <= most and not ((settled or goes_away) and not missing <= allowed)
         if inside:
-            return ""
+            return "", False
         ahead = most < sample.voltage < self.setpoint or self.setpoint < sample.voltage < least
-        word = "run ahead of its ramp" if ahead else "sagged" if sample.voltage < self.setpoint else "risen"
+        sagged = not ahead and sample.voltage < self.setpoint
+        word = "run ahead of its ramp" if ahead else "sagged" if sagged else "risen"
         return (
             f"the output has {word} to {sample.voltage:.0f} V with {self.setpoint:.0f} V set; the commanded ramp has "
-            f"it between {least:.0f} and {most:.0f} V"
+            f"it between {least:.0f} and {most:.0f} V",
+            sagged,
         )
 
     def _judge_ramp_down(self, sample: HVSample) -> None:

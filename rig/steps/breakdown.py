@@ -33,7 +33,8 @@ class Breakdown(Step):
     """Raise the voltage until the film breaks down, up to a ceiling; nothing after it is carried out if it does.
 
     The scene's ``limits`` must allow the ceiling: voltage, field and tension are watched as ever, and where one of them
-    is met first the result says so and counts, like the ceiling, as survived.
+    is met first the result says so and counts, like the ceiling, as survived. With a supply that measures no current,
+    a breakdown is an output that sags, and its voltage an upper bound.
     """
 
     needs_contact: ClassVar[bool] = True
@@ -162,10 +163,18 @@ class Last:
             self._h = self._rig.recorder.displacement
 
     def write(self, action: Rise, outcome: str, seconds: float) -> str:
-        """Write the result to the log; returns it in words."""
+        """Write the result to the log; returns it in words.
+
+        Without a current a film that broke down is seen only where the output sags: one of high resistance may have
+        broken down far below, and no uncertainty is stated.
+        """
         volts = self._newest.voltage if self._newest is not None else math.nan
         gap = self._newest.t - self._before.t if self._newest is not None and self._before is not None else math.nan
         apart = action.rise_in(gap) / math.sqrt(12.0)  # it broke anywhere between this sample and the next
+        hv = self._rig.scene.hv
+        at_most = outcome == BROKE and hv is not None and not hv.measures_current
+        if at_most:
+            apart = math.nan
         peak, edge, charge = film_at(self._rig.scene.specimen.specimen(), self._h, volts)
         share = apart / volts
         for name, value, uncertainty, unit in (
@@ -178,6 +187,7 @@ class Last:
         ):
             self._rig.recorder.result(action.step, action.kind, outcome, name, value, uncertainty, unit)
         words = {BROKE: "breakdown at", BORNE: "no breakdown up to", LIMITED: "no breakdown, a limit was met at"}
-        text = f"{words[outcome]} {volts:.0f} V, {peak * 1e-6:.1f} V/um in the film at {self._h * 1e3:.2f} mm"
+        bound = " or below (no current is measured)" if at_most else ""
+        text = f"{words[outcome]} {volts:.0f} V{bound}, {peak * 1e-6:.1f} V/um in the film at {self._h * 1e3:.2f} mm"
         self._rig.event("film", text)
         return text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -93,6 +94,23 @@ def test_every_breakdown_is_off_and_proven(tell: Tell, films: int) -> None:
             )
         story.log.unlink()
         print(broken, flush=True)
+
+
+@pytest.mark.slow
+def test_without_a_current_an_output_that_sags_is_a_breakdown_and_its_voltage_an_upper_bound(tell: Tell) -> None:
+    broken = ("[simulation.film]", "[simulation.film]\nbreakdown_field_MV_per_m = 25.0")
+    arc = ("[simulation.hv]", "[simulation.hv]\narc_resistance_kOhm = 400.0")
+    story = tell(
+        scene="other-instruments", replace=broken, also=arc, protocol=TEST.replace("1700", "1200"), checked=False
+    )
+    assert story.error is None and story.outcome.status == "complete" and story.outcome.safe, story.outcome
+    assert story.bench.world.broken_down and story.final_output < 60.0
+    found = results(story)
+    assert {one["outcome"] for one in found.values()} == {"breakdown"}
+    truth = story.bench.world.film.breakdown_voltage(3e-3)
+    assert found["voltage"]["value"] == pytest.approx(truth, rel=0.1)
+    assert all(math.isnan(found[name]["standard_uncertainty"]) for name in ("voltage", "field", "field_at_disk"))
+    assert "or below (no current is measured)" in story.outcome.reason
 
 
 def test_a_film_that_bears_the_ceiling_is_censored_there_and_the_run_goes_on(tell: Tell) -> None:
