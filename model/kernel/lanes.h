@@ -58,8 +58,9 @@ static inline Real sqrt_of(Real x) {
 
 static inline Mask yes(void) { return of(0.0) == of(0.0); }
 static inline Mask finite(Real x) { return abs_of(x) < (double)INFINITY; }
-static inline Real larger(Real x, Real y) { return pick(x > y, x, y); }
-static inline Real smaller(Real x, Real y) { return pick(x < y, x, y); }
+/* Not a number, in whichever place, is the largest and the smallest of all: nothing that was missed is lost. */
+static inline Real larger(Real x, Real y) { return pick((x > y) | (x != x), x, y); }
+static inline Real smaller(Real x, Real y) { return pick((x < y) | (x != x), x, y); }
 static inline Real clipped(Real x, double most) { return smaller(larger(x, of(-most)), of(most)); }
 
 #endif

@@ -16,7 +16,7 @@ enum {
 #define CUT_POWER 2.6
 #define CUT_GOAL 0.9 /* a cut stays where it has settled: what it lacks must leave room for the rest of the estimate */
 #define CURVED 2.0
-#define UNSEEN 0.3 /* of the tolerance: share of the pull along the film that a zone which is not cut out may push around */
+#define UNSEEN 0.05 /* of the tolerance: share of the pull along the film that a zone which is not cut out may push around */
 #define SLACK_GOALS 5.0 /* times Newton's goal: share of the largest tension that may have a wrong sign */
 
 /* Breaks moved to where the hoop tension of the panels vanishes, in `breaks`; returns the largest shift over an

@@ -18,6 +18,7 @@ from model.arrays import Array
 from model.material.law import relax, stack, stress
 from model.membrane.output import edges
 from model.membrane.ritz import Grid, Problem, State, evaluate
+from model.membrane.soft_cone import along
 from model.membrane.wrinkled_cone import natural_width
 
 BETWEEN = 4  # pieces of the way from one point to the next
@@ -56,16 +57,18 @@ def stations(problem: Problem, grid: Grid, state: State, lam: Array) -> Stations
     states = len(lam)
     share = np.linspace(0.0, 1.0, BETWEEN, endpoint=False)[None, :, None]
 
-    def along(values: Array, ends: Array) -> Array:
+    def cut(values: Array, ends: Array) -> Array:
         inside = values.swapaxes(0, 1).reshape(-1, states)
         all_ = np.concatenate((ends[:1], inside, ends[1:]))
         pieces = all_[:-1, None] + share * (all_[1:] - all_[:-1])[:, None]
         return np.concatenate((pieces.reshape(-1, states), all_[-1:]))
 
     clamped = np.broadcast_to(problem.log_prestretch, edge.log1.shape)
-    return Stations(
-        along(at.log[0], edge.log1), along(at.hoop, clamped), along(at.log[1], edge.log2), state.relaxed is not None
-    )
+    log1, log2, hoop = at.log[0], at.log[1], at.hoop
+    if state.cones is not None:
+        seen = along(problem, grid, state, at)
+        log1, log2, hoop = seen.log1, seen.log2, seen.hoop
+    return Stations(cut(log1, edge.log1), cut(hoop, clamped), cut(log2, edge.log2), state.relaxed is not None)
 
 
 def margin(problem: Problem, found: Stations) -> Array:

@@ -25,6 +25,7 @@ CHECK_MODES = 6  # of a way that is only looked at
 WAY = (2, 5)  # steps of V^2 to an answer that is there already: so many, and then so many
 WAY_GOAL, WAY_STEPS = 3e-2, 8  # of Newton on that way
 ROUGH = 1e-6  # tolerance on the way
+EDGE, JUDGE = 0.05, 1e-9  # margin of convexity below which the state at this tolerance judges
 TIGHT, LEAST = 1e-8, 1e-12  # those of a wrinkled state which does not settle to a looser one
 
 
@@ -109,7 +110,7 @@ def settled(
     for answer in answers:
         answer.index = these[answer.index]
     if problem.film.field is not None:
-        good = [_margin(problem.take(answer.index), answer) > 0.0 for answer in answers]
+        good = [_convex(problem, these, answer, begin, relaxed) for answer in answers]
         for answer, convex in zip(answers, good, strict=True):
             ended.unstable[answer.index[~convex]] = True
         answers = [answer.take(convex) for answer, convex in zip(answers, good, strict=True)]
@@ -176,6 +177,23 @@ def _led(problem: Problem, end: Start, begun: State, steps: int) -> NDArray[np.b
         before, last = last, found.state
     ahead = 2.0 * last.w - before.w
     return np.asarray(good & (np.abs(ahead / end.state.w - 1.0).max(axis=(0, 1)) < continuation.CORRECTION))
+
+
+def _convex(
+    problem: Problem, these: NDArray[np.intp], answer: Answer, begin: Start, relaxed: bool
+) -> NDArray[np.bool_]:
+    """Whether the law is convex along the films of an answer to ``these``.
+
+    Where that hangs on digits that a resolution leaves open one resolution judges for every tolerance.
+    """
+    margin = _margin(problem.take(answer.index), answer)
+    for k in np.flatnonzero((np.abs(margin) < EDGE) & relaxed).tolist():
+        one = answer.index[[k]]
+        fine, _, _ = _settled(problem.take(one), JUDGE, begin.take(these == one), relaxed)
+        for judge in fine:
+            if len(judge.index):
+                margin[k] = _margin(problem.take(one), judge)[0]
+    return np.asarray(margin > 0.0)
 
 
 def _margin(problem: Problem, answer: Answer) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 from model.arrays import Array
 from model.material.law import relax, stack, stress
 from model.membrane.ritz import Grid, Index, Points, Problem, State, barycentric, table
+from model.membrane.soft_cone import along
 
 FINE = 33  # points of an element where an extreme inside the film is looked for
 
@@ -78,6 +79,12 @@ def edges(problem: Problem, grid: Grid, state: State, at: Points, lam: Array) ->
         # A wrinkled element is a straight cone: its slope tells the pull at its end.
         sin = np.stack((state.w[0, 0], state.w[-1, -1])) / np.sqrt(np.stack((at.metric[0, 0], at.metric[-1, -1])))
         pull = np.where(wrinkled, lam / sin, pull) * np.where(wrinkled, [1.0 / inner, np.ones_like(inner)], 1.0)
+        if state.cones is not None:
+            for end, here in enumerate(wrinkled[:, 0].tolist()):
+                if here:
+                    log1[end] = state.cones.u[end, -end] + problem.log_prestretch
+                    log2[end] = state.cones.natural[end, -end]
+                    pull[end] = state.cones.pull[-end] / (1.0 if end else inner)
     start1, start2 = log1, log2
     for n in range(4):
         now = stress(problem.film, stack(log1, log2))
@@ -126,10 +133,10 @@ def series(c: Sequence[Number], xi: Number) -> tuple[Number, Number, Number]:
     return value, slope, curve
 
 
-def _largest(grid: Grid, values: Array, ends: Array) -> tuple[Array, Array]:
+def _largest(grid: Grid, values: Array, ends: Array, x: Array | None = None) -> tuple[Array, Array]:
     """Largest values over the film, (K, S), from those at the points (K, Q, M, S) and at both edges (K, 2, S).
 
-    Also R/b where each stands.
+    Also R/b where each stands; ``x`` is ln(R/b) of points that are not the grid's (Q, M, S).
     """
     best = ends.max(axis=1)
     radius = np.where(ends[:, 0] >= ends[:, 1], np.exp(grid.breaks[0]), 1.0)
@@ -149,7 +156,10 @@ def _largest(grid: Grid, values: Array, ends: Array) -> tuple[Array, Array]:
         peak = value + step * (slope + 0.5 * curve * step)  # the last step is so short that its cube is nothing
         better = peak > best[kind, state]
         x0, x1 = grid.breaks[element, state], grid.breaks[element + 1, state]
-        at = np.exp(x0 + 0.5 * (1.0 + xi) * (x1 - x0))
+        place = x0 + 0.5 * (1.0 + xi) * (x1 - x0)
+        if x is not None:
+            place = np.clip(series(list(t.to_legendre @ x[:, element, state]), xi)[0], x0, x1)
+        at = np.exp(place)
         best[kind, state] = np.where(better, peak, best[kind, state])
         radius[kind, state] = np.where(better, at, radius[kind, state])
     return best, radius
@@ -169,7 +179,12 @@ def extremes(problem: Problem, grid: Grid, state: State, at: Points, lam: Array)
     np.negative(edge.t1, out=ends[2])
     values[3:] = log[:2]
     ends[3], ends[4] = edge.log1, edge.log2
-    best, radius = _largest(grid, values, ends)
+    x: Array | None = None
+    if state.cones is not None:
+        seen = along(problem, grid, state, at)
+        x = seen.x
+        values[:] = seen.log1 + seen.log2, -seen.t2, -seen.t1, seen.log1, seen.log2
+    best, radius = _largest(grid, values, ends, x)
     if law.maxwell is None:
         softening = np.zeros(len(lam))
     else:

@@ -36,6 +36,7 @@ ROUND_OFF = 1e-13
 CLEARLY_NEGATIVE = -1e-2
 ROUND_OFF_TENSION = -1e-9
 MANY = 50  # states from which on those that have settled are worth leaving behind
+WIDER = 0.3  # of ln(l2): most that a step changes a natural width, where the film hardly resists
 LEAST_SHARE = 0.15  # of the tolerance: below it no estimate is claimed, two resolutions may agree by chance
 
 
@@ -65,6 +66,8 @@ class Iterate:
             yield mine.natural, its.natural
         if mine.relaxed is not None and its.relaxed is not None and mine.relaxed.flags.writeable:
             yield mine.relaxed, its.relaxed
+        if mine.cones is not None and its.cones is not None:
+            yield from zip(mine.cones.arrays(), its.cones.arrays(), strict=True)
 
     def restore(self, old: Iterate, these: NDArray[np.bool_]) -> None:
         """Take back ``these`` of an earlier step."""
@@ -189,7 +192,7 @@ def advance(state: State, step: ritz.Step, at: ritz.Points, grid: Grid) -> tuple
     natural = state.natural
     relief = law.relief
     if natural is not None and relief is not None:
-        natural = natural + relief.change + relief.rate * short * along
+        natural = natural + np.clip(relief.change + relief.rate * short * along, -WIDER, WIDER)
     return State(c, moved, natural, state.relaxed), felt
 
 
@@ -295,6 +298,7 @@ def prolonged(start: Start, modes: int) -> Start:
             w,
             None if natural is None else moved(natural),
             None if relaxed is None else np.broadcast_to(relaxed[:1], w.shape),
+            start.state.cones,
         ),
     )
 

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from model.arrays import Array
 from model.material.law import Film, Stress, relax, stack, stress
+from model.membrane.straight import Straight
 
 Index = NDArray[np.intp] | NDArray[np.bool_]
 
@@ -293,6 +294,7 @@ class State:
     w: Array  # (Q, M, S) slopes
     natural: Array | None = None  # (Q, M, S) natural ln(l2) where relaxed
     relaxed: NDArray[np.bool_] | None = None  # (Q, M, S) where the hoop stress is relaxed to zero
+    cones: Straight | None = None  # wrinkled elements where points do not tell enough
 
     def take(self, index: Index) -> State:
         return State(
@@ -300,6 +302,7 @@ class State:
             self.w[..., index],
             None if self.natural is None else self.natural[..., index],
             None if self.relaxed is None else self.relaxed[..., index],
+            None if self.cones is None else self.cones.take(index),
         )
 
     def put(self, index: Index, other: State) -> None:

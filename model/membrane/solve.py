@@ -455,7 +455,7 @@ class _Block:
         taut: list[tuple[NDArray[np.bool_], NDArray[np.intp], Answer]] = []
         for answer, other in zip(answers, others, strict=True):
             x = answer.extremes
-            these = (x.softening > SOFTENING) | (x.meridional <= 0.0)
+            these = ~((x.softening <= SOFTENING) & (x.meridional > 0.0))
             soft.append(these)
             asked = np.flatnonzero(these & (x.meridional > 0.0) & ~other)
             if len(asked) and answer.state.relaxed is None:  # soft wrinkled ones are followed, every one

@@ -25,14 +25,17 @@ from model.membrane import refinement, ritz
 from model.membrane.output import FINE, fine_table
 from model.membrane.refinement import Answer, Finished, Iterate, Start
 from model.membrane.ritz import Grid, Points, Problem, State
-from model.membrane.soft_cone import SoftCones
-from model.membrane.wrinkled_cone import Cones, Springs, natural_width, whole
+from model.membrane.soft_cone import Along, SoftCones, along
+from model.membrane.wrinkled_cone import NEAR, Cones, Springs, natural_width, whole
 
 START_MODES = 5
+# To begin with. A narrow zone may be there only with more: its cut runs out of the film with fewer.
+START_CUT_MODES, MORE_CUT_MODES = 3, 8
 MOST_ZONES = 5
 ROUNDS = 4
-MISSED = 0.02  # of the tolerance: third power of a wrong tension that changes the force of a soft film by a tenth of it
-UNSEEN = 0.3  # of the tolerance: share of the pull along the film that a zone which is not cut out may push around
+MISSED = 0.02  # of the tolerance: third power of the wrong tension that a careful solution lets stand beside a cut
+UNSEEN = 0.05  # of the tolerance: share of the pull along the film that a zone which is not cut out may push around
+UNSEEN_SOFT = 0.005  # the same near loss of convexity, where folds stretch the film by that much more
 SLACK = 5.0  # times Newton's goal: share of the largest tension that may have a wrong sign, as it has beside a cut
 STEPS, CAREFUL_STEPS = 15, 40  # most of a rung
 CALM = 1e-4  # change of the strains from which a careful solution moves its cuts
@@ -76,7 +79,8 @@ def search(problem: Problem, grid: Grid, state: State, goal: float = 2e-2, limit
         folded = np.where(state.relaxed, at.hoop < state.natural + relief.change, at.law.t2 < 0.0)
         flips = (folded != state.relaxed).any(axis=(0, 1))
         state = State(new.c, new.w, np.where(folded & state.relaxed, new.natural, at.hoop), folded)
-        quiet = (change <= goal) & ~flips
+        wider = np.abs(np.where(folded, relief.change, 0.0)).max(axis=(0, 1), initial=0.0)
+        quiet = (change <= goal) & (wider <= NEAR) & ~flips
         ok = quiet & step.stable & relief.regular.all(axis=(0, 1)) & (step.lam > 0.0)
         found = Iterate(grid, state, step.lam, change, np.zeros(len(ok)), step.stable, ok, np.full(len(ok), n))
         if finished.ending(quiet | (n == limit)) and finished.put(found):
@@ -88,9 +92,10 @@ def search(problem: Problem, grid: Grid, state: State, goal: float = 2e-2, limit
 
 
 def wrong_sign(tolerance: float, careful: bool = False) -> float:
-    """Share of the largest tension that may have a wrong sign: its zone would change the force by the third power.
+    """Share of the largest tension that may have a wrong sign: beside a cut that stands as well as Newton asks for.
 
-    Of a soft film that is up to five times the third power.
+    A cut that stands off leaves one in proportion, and the energy errs by its third power. The force feels a zone that
+    has no cut at all by the second: what such a zone may do is bounded by `UNSEEN`.
     """
     share = SLACK * refinement.goal(max(tolerance, 1e-8))
     return min(share, math.cbrt(MISSED * tolerance)) if careful else share
@@ -106,16 +111,26 @@ class Zones:
 
 
 def zones(
-    grid: Grid, state: State, at: Points, slack: float = 0.0, unseen: float = 0.0, *, between: bool = True
+    grid: Grid,
+    state: State,
+    at: Points,
+    slack: float = 0.0,
+    unseen: float = 0.0,
+    *,
+    between: bool = True,
+    cones: Along | None = None,
 ) -> Zones:
     """Zones of a state, by the hoop stress where taut and by the slack in the width where wrinkled.
 
     A sign against the element's own kind counts only beyond ``slack`` times the largest value: with cuts in place their
     vicinity is round-off. Smaller ones count where what taut elements push around is more than a share ``unseen`` of
     what the film pulls along: its force errs by about as much. Without ``between`` the points alone are asked, and both
-    ends of taut elements: near loss of convexity the stretch is too steep for the polynomial through them.
+    ends of taut elements: near loss of convexity the stretch is too steep for the polynomial through them. Straight
+    ``cones`` are asked at even steps of their stretch.
     """
     tension = at.law.t2 if state.relaxed is None else np.where(state.relaxed, at.hoop - at.log[1], at.law.t2)
+    if cones is not None and state.relaxed is not None:
+        tension = np.where(state.relaxed, cones.hoop - cones.log2, tension)
     points, m, states = tension.shape
     whole = state.relaxed is None or bool((state.relaxed == state.relaxed[:1]).all())
     smooth = whole and between
@@ -132,6 +147,9 @@ def zones(
             tension = np.concatenate((ends[:1], tension, ends[1:]))
             share = np.concatenate(([0.0], share, [1.0]))
         fine = tension.swapaxes(0, 1).reshape(m * len(share), states)
+    x = grid.breaks[:-1, None] + share[:, None] * (grid.breaks[1:] - grid.breaks[:-1])[:, None]
+    if cones is not None and not smooth:
+        x[:, 1:-1] = cones.x.swapaxes(0, 1)
     folded = fine < 0.0
     if slack > 0.0 and whole and state.relaxed is not None:
         kind = np.repeat(state.relaxed[0], len(share), axis=0)
@@ -139,7 +157,6 @@ def zones(
         every = np.where(kind, fine < bound, folded)
         folded = np.where(kind, fine < bound, fine < -bound)
         pushed = np.where(kind, 0.0, np.maximum(-fine, 0.0)).reshape(m, len(share), states)
-        x = grid.breaks[:-1, None] + share[:, None] * (grid.breaks[1:] - grid.breaks[:-1])[:, None]
         pushed *= np.exp(2.0 * x)
         missed = (0.5 * (pushed[:, 1:] + pushed[:, :-1]) * np.diff(x, axis=1)).sum(axis=(0, 1))
         folded = np.where(missed > unseen * (grid.twice * at.law.t1).sum(axis=(0, 1)), every, folded)
@@ -153,10 +170,8 @@ def zones(
     low, high = fine[rows, columns], fine[rows + 1, columns]
     part = np.clip(low / (low - high), 0.05, 0.95)
     part = np.where(np.isfinite(part), part, 0.5)
-    element, place = np.divmod(np.stack((rows, rows + 1)), len(share))
-    left, right = grid.breaks[element, columns], grid.breaks[element + 1, columns]
-    x = left + share[place] * (right - left)
-    where[rank, columns] = x[0] + part * (x[1] - x[0])
+    x = x.reshape(len(fine), states)
+    where[rank, columns] = x[rows, columns] + part * (x[rows + 1, columns] - x[rows, columns])
     return Zones(changes, folded[0], where)
 
 
@@ -230,17 +245,20 @@ def _settle(
         springs = Springs.of(problem, grid, panels, cones, film.c)
         springs.join(system)
         step = ritz.solve(problem, panels, system)
-        before = film
+        before, pulled = film, cones.pull
         film, change = refinement.advance(film, step, at, panels)
         cones, bent = springs.advance(step.dc, step.lam)
         # A cut that moves carries the strains with it: they must have settled as well as the slopes.
         de, dq = panels.strain(step.dc)
         size = (np.abs(at.q) + before.w**2).max(axis=(0, 1), initial=1e-300)
-        change = np.maximum(np.maximum(change, bent), np.abs(dq).max(axis=(0, 1), initial=0.0) / size)
+        change = np.maximum(change, np.abs(dq).max(axis=(0, 1), initial=0.0) / size)
         tension = at.law.t2 + at.law.h12 * (at.along * dq + at.down * step.dw) + at.law.h22 * at.around * de
         breaks, shift = _moved(grid, panels, taut, cones.which, tension)
-        if careful:
-            breaks = np.where(change <= CALM, breaks, grid.breaks)
+        if careful and pulled is not None and cones.pull is not None:
+            # A cone that ends where the law is all but flat has no end before the cut stands where it should.
+            calm = np.maximum(change, np.abs(cones.pull / pulled - 1.0).max(axis=0, initial=0.0)) <= CALM
+            breaks = np.where(calm, breaks, grid.breaks)
+        change = np.maximum(change, bent)
         off = np.maximum((CAREFUL_WEIGHT if careful else CUT_WEIGHT) * shift, CUT_POWER * shift * np.sqrt(shift))
         change = np.maximum(change, off)
         done = change <= goal
@@ -249,7 +267,7 @@ def _settle(
         stable = step.stable & springs.regular
         if finished.ending(done | (n == limit)):
             ends = refinement.tail(problem, panels, film, step)
-            state = whole(grid, film, taut, cones.unrolled(problem, grid))
+            state = whole(grid, film, taut, cones.unrolled(problem, grid), cones.straight())
             ok = done & stable & (step.lam > 0.0)
             if finished.put(Iterate(grid, state, step.lam, change, ends, stable, ok, np.full(len(ok), n))):
                 break
@@ -321,13 +339,13 @@ def solve(
         lost.append(index[~found.ok])
         index = index[found.ok]
         begin = begin.take(found.ok)
-    pending = [(index, begin)]
+    pending = [(index, begin, START_CUT_MODES)]
     for _ in range(ROUNDS):
         queue, pending = pending, []
-        for some, begun in queue:
+        for some, begun, modes in queue:
             if len(some):
-                _round(problem, tolerance, sensitivities, careful, some, begun, steps, answers, lost, pending)
-    lost.extend(some for some, _ in pending)
+                _round(problem, tolerance, sensitivities, careful, some, begun, modes, steps, answers, lost, pending)
+    lost.extend(some for some, _, _ in pending)
     return answers, np.concatenate(lost), steps
 
 
@@ -338,12 +356,16 @@ def _round(
     careful: bool,
     index: NDArray[np.intp],
     start: Start,
+    fewest: int,
     steps: NDArray[np.intp],
     answers: list[Answer],
     lost: list[NDArray[np.intp]],
-    again: list[tuple[NDArray[np.intp], Start]],
+    again: list[tuple[NDArray[np.intp], Start, int]],
 ) -> None:
-    """Cut the elements where the zones of ``start`` end, and solve; other zones than before: once more (``again``)."""
+    """Cut the elements where the zones of ``start`` end, and solve with ``fewest`` modes or more.
+
+    Once more (``again``) are solved those with other zones than before, and with more modes those that do not settle.
+    """
     here = problem.take(index)
     settler = partial(settle, kind=SoftCones, careful=True) if careful else settle
     state = start.state
@@ -356,7 +378,7 @@ def _round(
             continue
         part, grid, chosen = here.take(some), start.grid.take(some), state.take(some)
         at = ritz.evaluate(part, grid, chosen)
-        zone = zones(grid, chosen, at, wrong_sign(tolerance, careful), UNSEEN * tolerance, between=not careful)
+        zone = _zones(part, grid, chosen, at, tolerance, careful)
         pattern = 2 * zone.changes + zone.first
         for number in np.unique(pattern).tolist():
             changes, first = number // 2, bool(number % 2)
@@ -364,13 +386,14 @@ def _round(
             if changes >= MOST_ZONES:
                 lost.append(index[some[of]])
                 continue
-            for cut in _alike(part.take(of), zone.where[:changes, of], tolerance):
+            for cut in _alike(part.take(of), zone.where[:changes, of], tolerance, fewest):
                 here_of = of[cut.index]
                 film = part.take(here_of)
                 breaks, wrinkled = _cut(film, zone.where[:changes, here_of], first, cut.pieces)
-                begun = remap(
-                    grid.take(here_of), chosen.take(here_of), at.log[1][..., here_of], breaks, cut.modes, wrinkled
-                )
+                old, begun_of = grid.take(here_of), chosen.take(here_of)
+                begun = remap(old, begun_of, at.log[1][..., here_of], breaks, cut.modes, wrinkled)
+                if chosen.relaxed is not None and np.array_equal(chosen.relaxed[0, :, 0], wrinkled):
+                    begun.state.cones = begun_of.cones
                 done, missed, spent = refinement.refine(
                     film,
                     tolerance,
@@ -381,24 +404,28 @@ def _round(
                     soft=careful or bool(wrinkled.all()),
                 )
                 where = index[some[here_of]]
-                lost.append(where[missed])
+                if changes and cut.modes < MORE_CUT_MODES:
+                    again.append((where[missed], Start(old, begun_of).take(missed), MORE_CUT_MODES))
+                else:
+                    lost.append(where[missed])
                 steps[where] += spent
                 for answer in done:
                     solved = film.take(answer.index)
-                    now = zones(
-                        answer.grid,
-                        answer.state,
-                        ritz.evaluate(solved, answer.grid, answer.state),
-                        wrong_sign(tolerance, careful),
-                        UNSEEN * tolerance,
-                        between=not careful,
-                    )
+                    at_end = ritz.evaluate(solved, answer.grid, answer.state)
+                    now = _zones(solved, answer.grid, answer.state, at_end, tolerance, careful)
                     same = (now.changes == changes) & (now.first == first) & admissible(answer.grid, answer.state)
                     answer.index = where[answer.index]
                     answer.steps = steps[answer.index]
                     answers.append(answer.take(same))
                     if not same.all():
-                        again.append((answer.index[~same], Start(answer.grid, answer.state).take(~same)))
+                        again.append((answer.index[~same], Start(answer.grid, answer.state).take(~same), cut.modes))
+
+
+def _zones(problem: Problem, grid: Grid, state: State, at: Points, tolerance: float, careful: bool) -> Zones:
+    """Zones of a state that is to be solved, or has been, to the tolerance."""
+    cones = along(problem, grid, state, at) if state.cones is not None else None
+    allowed = wrong_sign(tolerance, careful), (UNSEEN_SOFT if careful else UNSEEN) * tolerance
+    return zones(grid, state, at, *allowed, between=not careful, cones=cones)
 
 
 @dataclass(slots=True)
@@ -410,7 +437,7 @@ class _Alike:
     modes: int
 
 
-def _alike(film: Problem, edges: Array, tolerance: float) -> list[_Alike]:
+def _alike(film: Problem, edges: Array, tolerance: float, fewest: int) -> list[_Alike]:
     """Groups of the states with these zones, so that what a state gets does not depend on the others."""
     ends = np.concatenate((-film.span[None], edges, np.zeros((1, len(film.span)))))
     length = ends[1:] - ends[:-1]
@@ -422,6 +449,6 @@ def _alike(film: Problem, edges: Array, tolerance: float) -> list[_Alike]:
     else:
         rows, group = np.unique(key, axis=1, return_inverse=True)
     return [
-        _Alike(np.flatnonzero(group.ravel() == k), tuple(row[:-1].tolist()), max(3, modes[row[-1]]))
+        _Alike(np.flatnonzero(group.ravel() == k), tuple(row[:-1].tolist()), max(fewest, modes[row[-1]]))
         for k, row in enumerate(rows.T)
     ]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from model.arrays import Array
 from model.material.law import Stress, relax, stack, stress
 from model.membrane.ritz import Grid, Index, Problem, Reduced, State
+from model.membrane.straight import Straight
 
 NEAR = 1e-2  # of ln(l2): from here Newton on the whole film takes the natural width along
 
@@ -116,6 +117,10 @@ class Cones:
     def unrolled(self, problem: Problem, grid: Grid) -> Cones:
         """The cones with their stretches at the points in R."""
         return self
+
+    def straight(self) -> Straight | None:
+        """What a state must keep of them beside its points."""
+        return None
 
     def take(self, index: Index) -> Cones:
         """The states at ``index``."""
@@ -229,7 +234,7 @@ def _cut(panels: Grid, number: int) -> int:
     return panels.elements * panels.table.modes + number - 1 if inside else -1
 
 
-def whole(grid: Grid, panels: State, taut: tuple[int, ...], cones: Cones) -> State:
+def whole(grid: Grid, panels: State, taut: tuple[int, ...], cones: Cones, straight: Straight | None = None) -> State:
     """The state of the whole film on ``grid``, every element with its modes, from its parts."""
     t, m, states = grid.table, grid.elements, panels.c.shape[1]
     n = t.modes
@@ -249,4 +254,4 @@ def whole(grid: Grid, panels: State, taut: tuple[int, ...], cones: Cones) -> Sta
     relaxed = np.zeros(grid.radius.shape, dtype=np.bool_)
     w[:, others], w[:, index] = panels.w, slope
     natural[:, index], relaxed[:, index] = cones.natural, True
-    return State(c, w, natural, relaxed)
+    return State(c, w, natural, relaxed, straight)

@@ -47,6 +47,13 @@ EDGES = [
     (Specimen(0.0014732721086316263, 0.02, 3.758998274893242e-05, 1.001684646670073,
               Material("two", (15762.263272842258, 9.89079693623856), (2.024212119334433, 9.378546610701264), 3.0)),
      0.002096418079425675, 123.6403114992977),
+    (Specimen(0.00145691563449051, 0.02, 3.830822396575603e-05, 1.0117435383891449,
+              Material("one", (42552.25905180746,), (1.9039706716290732,), 3.0)),
+     0.0020903117601086983, 445.90557164845035),
+    # A narrow fold at the disk of a film near loss of convexity, which stretches ten times further for it.
+    (Specimen(0.004664767247591862, 0.02, 2.4125851452996098e-05, 1.7301694056625856,
+              Material("gent", (67175.67333901661,), (31.083922759695014,), 3.0, law=Gent)),
+     0.011315633124136582, 475.7358055302598),
 ]  # fmt: skip
 
 
@@ -68,6 +75,51 @@ def test_a_soft_state_that_does_not_settle_from_few_modes_is_begun_with_more() -
                    for t in (1e-6, 1e-8))  # fmt: skip
     assert rough.status is fine.status is Status.WRINKLED
     assert abs(rough.force / fine.force - 1.0) <= rough.error_estimate + fine.error_estimate
+
+
+# Folds from the disk to an edge, or to the ring, under a law that is all but flat at their outer end: no polynomial in
+# R knows such a cone. And a film without hoop tension that must widen by a seventh before it has its natural width.
+FLAT = [
+    (Specimen(0.0011528510320284611, 0.02, 1.9456674083352933e-05, 1.983538160518702,
+              Material("gent", (19456.546015388154,), (73.26214476098559,), 3.0, law=Gent)),
+     0.027931634961946537, 140.43584385488276),
+    (Specimen(0.001093757379240633, 0.02, 4.098253820574749e-05, 1.941739246870767,
+              Material("one", (10487.93208761269,), (3.928525244564822,), 3.0)),
+     0.025033491976182723, 701.1093097022718),
+    (Specimen(0.0063031161071722686, 0.02, 3.650176033575362e-05, 1.8653877782309054,
+              Material("three", (43326.990880290585, 204.69563530733393, 382.6161208415705),
+                       (3.520811225229857, 15.949161844662829, 7.046916298188088), 3.0)),
+     0.020212045887603013, 118478.95790427468),
+]  # fmt: skip
+# Finite elements from rest (`model.verification.continuation`), where they reach the state: the force (N), its error.
+BY_ELEMENTS = [(0.0268504304, 7e-5), (0.0953324063, 3e-5), (3651.46530281, 3e-6)]
+
+
+@pytest.mark.parametrize(
+    ("film", "h", "voltage", "force", "error"),
+    [(*state, *force) for state, force in zip(FLAT, BY_ELEMENTS, strict=True)],
+)
+def test_a_nearly_flat_law_has_one_answer(film: Specimen, h: float, voltage: float, force: float, error: float) -> None:
+    found = [solve(film, h, voltage, tolerance=t, wrinkling="tension_field") for t in (1e-4, 1e-6, 1e-8)]
+    for one in found:
+        assert one.status is Status.WRINKLED
+        assert abs(one.force / force - 1.0) <= one.error_estimate + error
+        # What is told beside the force does not hang on the resolution either.
+        assert one.max_stretch == pytest.approx(found[-1].max_stretch, rel=1e-6)
+        assert one.min_meridional_stress == pytest.approx(found[-1].min_meridional_stress, rel=1e-6)
+        assert one.peak_field == pytest.approx(found[-1].peak_field, rel=2e-3)
+
+
+@pytest.mark.slow
+def test_the_end_of_a_branch_is_the_same_at_every_tolerance() -> None:
+    film = Specimen(
+        0.0035061300655400947, 0.02, 3.1007780740443206e-05, 2.496652973475339,
+        Material("gent", (17289.021916459118,), (77.41272715108751,), 3.0, law=Gent),
+    )  # fmt: skip
+    h, end = 0.017707685161067997, 209.4991423543369  # the law loses convexity within 1e-4 of this voltage
+    for voltage, status in ((end, Status.UNSTABLE), (0.99 * end, Status.WRINKLED)):
+        for tolerance in (1e-4, 1e-6, 1e-8):
+            assert solve(film, h, voltage, tolerance=tolerance, wrinkling="tension_field").status is status
 
 
 # Taut films whose first two resolutions agree by chance, and stiffening ones in which a small step of Newton leaves
