@@ -24,7 +24,7 @@ from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time  # what work costs; when things happen is the clock's business
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +97,7 @@ MOST_SKIPPED = 500  # readings, where one loss follows so close on another that 
 
 @dataclass(frozen=True)
 class Polled:
-    """One instrument that answers questions. Round trips are NaN where they were not measured."""
+    """One instrument that answers questions."""
 
     role: str
     wanted_Hz: float
@@ -308,7 +308,8 @@ def _turn(bench: Bench, attention: Attention) -> list[tuple[str, Sample]]:
         attention.polled(role, now)
         samples += [(role, sample) for sample in bench.poll(role, now)]
     due, awaited = attention.next()
-    attention.wait(began + SHORTEST_TURN_S, min(max(due, began + SHORTEST_TURN_S), began + LONGEST_TURN_S), awaited)
+    latest = began + LONGEST_TURN_S + attention.puts_off
+    attention.wait(began + SHORTEST_TURN_S, min(max(due, began + SHORTEST_TURN_S), latest), awaited)
     return samples
 
 
@@ -342,11 +343,11 @@ def _whole_run(folder: Path, hold_s: float, progress: Callable[[float], None]) -
     elapsed = ended - begun
     shares = {who: (after[who] - before[who]) / elapsed for who in after if who in before}
     log = read_log(log_path)
-    tables = log.tables(["/force/sample", "/stage/sample", "/displacement/sample"])
+    tables = log.tables(["/force/sample", "/stage/sample", "/displacement/sample", "/counter", "/phase"])
+    of_hold = tables["/phase"]["t_s"][int(np.flatnonzero(tables["/phase"]["kind"] == "hold")[-1]) :]
+    between = (float(of_hold[0]), float(of_hold[1])) if hold_s else (0.0, math.inf)
     t = tables["/force/sample"]["t_s"]
     gaps = np.round(np.diff(t) * FORCE_HZ) - 1
-    rates = {"stage": STAGE_HZ, "displacement": LASER_HZ}
-    reached = {role: len(t) / (t[-1] - t[0]) for role in rates for t in (tables[f"/{role}/sample"]["t_s"],)}
     readings = tables["/force/sample"]["reading"]
     lasted = float(t[-1] - t[0])
     return Row(
@@ -358,9 +359,27 @@ def _whole_run(folder: Path, hold_s: float, progress: Callable[[float], None]) -
         int(gaps[gaps > 0].sum()) + sum(log.missing.get(f"/{role}/sample", 0) for role in ROLES),
         sum(shares.values()),
         (there_after - there_before) / elapsed,
-        [Polled(role, rates[role], reached[role], math.nan, math.nan, 0, 0) for role in rates],
+        [
+            _polled_in_log(tables, role, wanted, between)
+            for role, wanted in (("stage", STAGE_HZ), ("displacement", LASER_HZ))
+        ],
         shares,
     )
+
+
+def _polled_in_log(
+    tables: Mapping[str, Mapping[str, Any]], role: str, wanted: float, between: tuple[float, float]
+) -> Polled:
+    """Samples between two times; round trips and retries, as the driver has counted them, of the whole run."""
+    counted = zip(*(tables["/counter"][key] for key in ("device", "name", "count")), strict=True)
+    of_it = {name: int(count) for device, name, count in counted if device == role}
+    t = tables[f"/{role}/sample"]["t_s"]
+    t = t[(t >= between[0]) & (t <= between[1])]
+    lasted, samples = float(t[-1] - t[0]), len(t) - 1
+    mean_us = of_it["round_trip_sum_us"] / of_it["round_trips"]
+    missed = max(round(lasted * wanted) - samples, 0)
+    longest_us = of_it["round_trip_max_us"]
+    return Polled(role, wanted, samples / lasted, 1e-3 * mean_us, 1e-3 * longest_us, of_it["retries"], missed)
 
 
 def _processor_times() -> dict[str, float]:

@@ -16,11 +16,16 @@ from drivers.dialogue import LOOK_AGAIN_S
 from rig.bench.bench import Bench
 
 STREAM_S = 0.003  # what streams, or has come unasked, is read again after so long: not in two turns that are close
-LONGEST_S = 0.01  # and every instrument after so long, whatever the system says
+LONGEST_S = 0.01  # who awaits an answer, or cannot say when he wishes to be polled, is polled after so long ...
+TOGETHER_S = 0.0025  # who wishes to be polled may be put off so long, to be polled in one turn with others
+IDLE_S = 0.05  # ... and who has nothing to do until a time that he tells; whatever the system says
 
 
 class Attention:
-    """Of one bench, whose devices have been attached."""
+    """Of one bench, whose devices have been attached.
+
+    ``puts_off``: by how much a turn may be put off (s); nothing on a bench in memory.
+    """
 
     def __init__(self, bench: Bench) -> None:
         self._clock = bench.clock
@@ -33,6 +38,7 @@ class Attention:
         # An answer on a connection of several may have been read already, by another of them.
         self._links = {role: one for role, one in self._descriptors.items() if bench.has_link(role) and users[one] == 1}
         self._watched = sorted(set(self._descriptors.values()))
+        self.puts_off = TOGETHER_S if self._descriptors else 0.0
 
     def wanted(self, now: float) -> Sequence[str]:
         """The roles to be polled in the turn that begins ``now``, in the order of the bench."""
@@ -55,23 +61,29 @@ class Attention:
         polled, wish = self._polled[role], self._devices[role].next_poll
         if wish == polled + LOOK_AGAIN_S and role in self._links:
             return descriptor in came or not now - polled < LONGEST_S
-        return now >= wish or not now - polled < (STREAM_S if descriptor in came else LONGEST_S)
+        if now >= wish:
+            return True
+        longest = STREAM_S if descriptor in came else IDLE_S if now < wish else LONGEST_S  # NaN is no time
+        return not now - polled < longest
 
     def polled(self, role: str, now: float) -> None:
         """To be told of each poll, and the time that the device was told."""
         self._polled[role] = now
 
     def next(self) -> tuple[float, list[int]]:
-        """When one of them wants to be polled if nothing comes before, and by what descriptors answers are awaited.
+        """When a turn is due if nothing comes before, and by what descriptors answers are awaited.
 
         Who only looks for an answer is known by what `drivers.dialogue.Dialogue.next_poll` says then, to the digit.
         """
         due, awaited = math.inf, []
         for role, device in self._devices.items():
             wish = device.next_poll
-            if wish == self._polled[role] + LOOK_AGAIN_S and role in self._links:
+            if wish != self._polled[role] + LOOK_AGAIN_S:
+                wish += self.puts_off
+            elif role in self._links:
                 awaited.append(self._links[role])
-            elif wish < due:
+                continue
+            if wish < due:
                 due = wish
         return due, awaited
 

@@ -56,9 +56,9 @@ ROUNDING_S = 1e-6  # of clock times: whether a turn is the last one must not han
 OUTPUT_LIMIT_S = 3.0  # how long a supply may take after set-up to be measured off
 
 
-def _within_bounds(now: float, wanted: float) -> float:
-    """When the turn after that of ``now`` begins, for devices that wish it at ``wanted``."""
-    return min(max(now + SHORTEST_TURN_S, wanted), now + LONGEST_TURN_S)  # in this order NaN is no time
+def _within_bounds(now: float, wanted: float, puts_off: float = 0.0) -> float:
+    """When the turn after that of ``now`` begins, for devices that wish it at ``wanted``, which has been put off."""
+    return min(max(now + SHORTEST_TURN_S, wanted), now + LONGEST_TURN_S + puts_off)  # in this order NaN is no time
 
 
 def _lets_ramp_down(error: Exception) -> bool:
@@ -476,7 +476,7 @@ class Engine:
             self._beat(self._watch, now)
         self.recorder.tick(now)
         due, awaited = attention.next()
-        attention.wait(began + SHORTEST_TURN_S, _within_bounds(began, due), awaited)
+        attention.wait(began + SHORTEST_TURN_S, _within_bounds(began, due, attention.puts_off), awaited)
 
     def _poll(self, role: str, now: float) -> Sequence[Sample]:
         """New samples. An instrument that only says what air it is ends no run, once it has begun."""

@@ -18,6 +18,7 @@ SLOWEST_UP, SLOWEST_DOWN = 0.8, 0.6  # downwards a film may discharge more slowl
 BEGINS_S = 0.5  # from the confirmed command to the first movement, and from a measurement to its sample
 LAG_S = 0.1
 LATEST_S = 10.0  # a command that is not confirmed by then counts as confirmed
+RAMP_MARGIN, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
 
 
 @dataclass
@@ -79,3 +80,8 @@ def _towards(start: float, end: float, way: float) -> float:
     """From ``start`` so far towards ``end``, and no further."""
     whole = end - start
     return end if way >= abs(whole) else start + math.copysign(max(way, 0.0), whole)
+
+
+def ramp_limit(duration: float) -> float:
+    """How long a ramp down that should take ``duration`` may take in all (s)."""
+    return duration * RAMP_MARGIN + RAMP_GRACE_S

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from drivers.roles import GivesBack, HVFlag, HVSample, HVSupply, MonitorSample, OwnTrip, Renewed
 from rig.base.errors import Breakdown, BreakdownCurrent, FaultError, LimitError, StaleData
-from rig.safety.commanded import DEVIATION_PART, DEVIATION_V, CommandedRamp
+from rig.safety.commanded import DEVIATION_PART, DEVIATION_V, CommandedRamp, ramp_limit
 from rig.safety.heartbeat import DEADLINE_S, Heartbeat
 from rig.safety.limits import FilmLimits, Limit, Limits
 from rig.safety.stopped import LOOK_S, Peer
@@ -33,7 +33,6 @@ DEVIATION_SAMPLES = 2  # ... and so many samples in a row that show it outside, 
 FROZEN_SAMPLES = 25  # this many equal measurements of voltage and current in a row: last digits are never so quiet
 FROZEN_RAMP_V, FROZEN_RAMP_SAMPLES = 100.0, 3  # nor does a ramp over so much leave so many voltages equal
 FILM_CHECK_S = 0.05  # how often the model is asked about the measured (displacement, voltage)
-RAMP_MARGIN, RAMP_GRACE_S = 1.5, 10.0  # a ramp down may take this much longer than it should before it is cut short
 AT_ONCE_S = 4.0  # how long an emergency off may take to be measured before the output is called NOT SAFE
 NOT_SAFE = f"NOT SAFE: the output was not measured off (below {SAFE_VOLTAGE:.0f} V, and the channel off)."
 ADVICE = "Keep away; switch the supply off at its mains switch and use the grounding stick."
@@ -93,7 +92,8 @@ class Guard:
         self.setpoint = 0.0
         self.ramps_down = False  # whether the last off was a ramp, which takes its time
         self._supply = supply
-        self._renew = supply.renew if isinstance(supply, Renewed) else None  # asked here once: it is slow
+        self._renew = supply.renew if isinstance(supply, Renewed) else None  # both asked here once: it is slow
+        self._lent = supply if isinstance(supply, GivesBack) else None
         self._limits = limits
         self._film = film
         self._ramp = ramp
@@ -257,13 +257,13 @@ class Guard:
     @property
     def given_back(self) -> bool:
         """Whether the supply has everything back that arming changed."""
-        return not isinstance(self._supply, GivesBack) or self._supply.given_back
+        return self._lent is None or self._lent.given_back
 
     def give_back(self) -> None:
         """Put back what arming changed in the supply; only while the output is measured off."""
-        if isinstance(self._supply, GivesBack) and self.output_is_safe and self.state is GuardState.SAFE:
+        if self._lent is not None and self.output_is_safe and self.state is GuardState.SAFE:
             self._tell(GIVE_BACK, "")
-            self._supply.give_back()
+            self._lent.give_back()
 
     def request(self, volts: float, h: float) -> None:
         """Ramp the output to ``volts`` with the disk at displacement ``h`` metres.
@@ -363,6 +363,13 @@ class Guard:
                 raise
         if self._renew is not None:
             self._renew()
+
+    @property
+    def next_look(self) -> float:
+        """When `turn` has something to judge, though nothing may have come by then; infinity while latched."""
+        if self.state is GuardState.SAFE or self._alive_at is None:
+            return math.inf
+        return min(self._next_film_check, self._alive_at + LOOK_S)
 
     def _judge_engine(self, now: float) -> None:
         if self._alive_at is None:
@@ -511,7 +518,7 @@ class Guard:
         on = HVFlag.ON in sample.flags
         self._seen_on = self._seen_on or on
         settled = on and not self._supply.busy and HVFlag.RAMPING not in sample.flags
-        problem, sagged = "", False
+        sagged = False
         if self._seen_on and not on:
             problem = "the supply says that it is off, and nobody switched it off from here"
         elif settled and not math.isclose(sample.setpoint, self.setpoint, rel_tol=1e-3, abs_tol=1.0):
@@ -586,11 +593,6 @@ class Guard:
         self.cause = cause
         self.setpoint = 0.0
         self._low_samples = self._deviating_samples = 0
-
-
-def ramp_limit(duration: float) -> float:
-    """How long a ramp down that should take ``duration`` may take in all (s)."""
-    return duration * RAMP_MARGIN + RAMP_GRACE_S
 
 
 def flag_names(flags: Flag) -> str:

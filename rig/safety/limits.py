@@ -20,6 +20,7 @@ MONITOR_V = 50.0
 MONITOR_GAIN = 1.03
 # So little raised a film is flat to eight digits, and solved in a tenth of the time that the exactly flat one takes.
 FLAT_M = 1e-6
+SAME_M, SAME_V = 2e-6, 1.0  # a film that has moved less takes no charge that could be told from the leakage
 # An unloaded sensor may be off by this part of the force limit from its stored zero: beyond it something is wrong with
 # it. Where a zero is stored the limit holds against it at all times, so that no zero step can carry the limit away;
 # where none is, it holds against the bare reading with this allowance.
@@ -139,6 +140,7 @@ class FilmLimits:
     def __init__(self, specimen: Specimen, limits: Limits) -> None:
         self._specimen = specimen
         self._limits = limits
+        self._capacitance = (math.nan, math.nan, math.nan)  # displacement, voltage and what the model said there
         # What is loaded or tabulated on first use takes a tenth of a second: now, and not between two turns of a loop.
         hangs_slack(specimen, FLAT_M, 1.0)
         solve(specimen, FLAT_M, 1.0)
@@ -175,9 +177,17 @@ class FilmLimits:
         return bound if self._limits.energy.holds(bound) or v2 == 0.0 else 0.5 * state.capacitance() * v2 + beside
 
     def capacitance(self, h: float, voltage: float) -> float:
-        """Capacitance of film and cable (F) at displacement ``h`` metres; NaN where the model has no state."""
+        """Capacitance of film and cable (F) at displacement ``h`` metres; NaN where the model has no state.
+
+        Within `SAME_M` and `SAME_V` of where the model was last asked it is the same: by less than a thousandth.
+        """
+        last_h, last_voltage, known = self._capacitance
+        if abs(h - last_h) <= SAME_M and abs(voltage - last_voltage) <= SAME_V:
+            return known
         state = solve(self._specimen, max(h, FLAT_M), voltage)
-        return state.capacitance() + self._limits.parallel_capacitance if state.answered else math.nan
+        found = state.capacitance() + self._limits.parallel_capacitance if state.answered else math.nan
+        self._capacitance = h, voltage, found
+        return found
 
     def check_path(self, h0: float, h1: float, voltage: float, points: int = 5) -> None:
         """Check the film along a move from ``h0`` to ``h1`` metres at ``voltage`` volts, ends included.

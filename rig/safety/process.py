@@ -27,8 +27,6 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import click
-
 from drivers.dialogue import LOOK_AGAIN_S
 from drivers.links.link import DeviceError, DeviceLost
 from drivers.roles import GivesBack, HVSample, HVSupply, MonitorSample, SampleFlag
@@ -43,13 +41,15 @@ from rig.log.remote import RemoteLog
 from rig.log.schema import MONITORED, SETTINGS, Way
 from rig.safety.channel import Channel, ChannelDamaged, Message
 from rig.safety.guard import ADVICE, GIVE_BACK, NOT_SAFE, Guard, GuardState
+from rig.safety.last_words import LastWords
 from rig.safety.limits import FilmLimits, Limits
 from rig.safety.second import SecondReading
 from rig.safety.stopped import Peer
 from rig.safety.taken_over import TakenOver
 from rig.scene.scene import Scene
 
-SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005
+SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005  # the longest while an output is on its way to off
+ANSWER_S, IDLE_S = 0.01, 0.05  # a supply that awaits an answer, or nothing, is polled after so long at the latest
 STATE_S = 0.05  # how often the engine hears how it stands at least
 ALIVE_S = 0.02  # ... and that this loop turns
 AGAIN_S = 0.1  # a command that failed is given again at this interval
@@ -60,7 +60,6 @@ ENDING = ("SIGINT", "SIGTERM")  # signals that the guard obeys once its engine h
 GIVE_BACK_S = 1.0  # how long the supply may take to confirm that it has its settings back
 HUNG_S = 0.5  # an engine that has said nothing for so long reads no monitor either
 SPEAK_S = 1.0  # how long the last word may wait for a terminal that takes nothing
-STDERR = 2
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 MAY_BE_CALLED = (
     "arm",
@@ -158,6 +157,7 @@ class Server:
         self._came = True  # whether it has said so
         self._host = HostTime(clock)
         self._supply: HVSupply | None = None
+        self._lent: GivesBack | None = None  # the supply, where it gives back what arming changes
         self._guard: Guard | None = None
         self._gain = 1.0
         self._monitor: TakenOver | None = None  # read from here only when the engine does not
@@ -218,18 +218,21 @@ class Server:
             self._channel.send({"is": "alive"})
             self._next_alive = now + ALIVE_S
 
-    def _awaits(self, guard: Guard, supply: HVSupply) -> bool:
-        """Whether an answer is all that is waited for, by what `Dialogue.next_poll` says then, and the link tells it.
+    def _due(self, guard: Guard, supply: HVSupply) -> float:
+        """When the supply is to be polled, if nothing comes before.
 
-        Never while an output that was commanded off is not measured off: then nothing is left to the link.
+        While an output that was commanded off is not measured off, nothing is left to the link.
         """
         goes_off = guard.commanded and guard.state is GuardState.SAFE and not guard.output_is_safe
-        return self._descriptor is not None and not goes_off and supply.next_poll == self._polled_at + LOOK_AGAIN_S
+        if self._descriptor is None or goes_off:
+            return min(self._polled_at + LONGEST_TURN_S, supply.next_poll)  # in this order NaN is no time
+        if self._awaits(supply):
+            return self._polled_at + ANSWER_S
+        return min(self._polled_at + IDLE_S, supply.next_poll)
 
-    def _due(self, guard: Guard, supply: HVSupply) -> float:
-        """When the supply is to be polled, if nothing comes before."""
-        longest = self._polled_at + LONGEST_TURN_S
-        return longest if self._awaits(guard, supply) else min(supply.next_poll, longest)
+    def _awaits(self, supply: HVSupply) -> bool:
+        """Whether an answer is all that is waited for, by what `Dialogue.next_poll` says then."""
+        return supply.next_poll == self._polled_at + LOOK_AGAIN_S
 
     def _heard(self, now: float) -> None:
         """The engine turns: what it lent is its own again."""
@@ -283,29 +286,34 @@ class Server:
         return replace(sample, voltage=sample.voltage * self._gain)
 
     def _wait(self) -> None:
+        """Until something comes, or there is something to do."""
         now = self._clock.now()
         self._words.speak()
         self._tick_log(now)
-        guard, supply = self._guard, self._supply
-        awaits = guard is not None and supply is not None and self._awaits(guard, supply)
-        due = now if guard is None or supply is None else self._due(guard, supply)
-        wait = LONGEST_TURN_S if supply is None else min(max(due - now, SHORTEST_TURN_S), LONGEST_TURN_S)
+        due, watched = now + LONGEST_TURN_S, False
+        if self._guard is not None and self._supply is not None:
+            look = self._guard.next_look
+            due = min(self._due(self._guard, self._supply), self._next_alive, look if look > now else due)
+            unasked = self._polled_at + LONGEST_TURN_S  # what comes unasked, on a full bus, is not read one by one
+            watched = now >= unasked or self._awaits(self._supply)
+            due = due if watched else min(due, unasked)
+        wait = max(due - now, SHORTEST_TURN_S)
         self._came = self._descriptor is None
         if self._channel.closed:
             self._came = True
-            self._clock.sleep_until(now + wait)
-        else:
-            self._channel.flush()
-            watched: list[Channel | int] = [self._channel]
-            if awaits and self._descriptor is not None:
-                watched.append(self._descriptor)
-            try:
-                readable, _, _ = select.select(watched, [], [], wait)
-            except (OSError, ValueError):  # the link was closed, and says so when it is read
-                self._descriptor, self._came = None, True
-                self._clock.sleep_until(now + wait)
-                return
-            self._came |= self._descriptor in readable
+            self._clock.sleep_until(now + min(wait, LONGEST_TURN_S))
+            return
+        self._channel.flush()
+        ends: list[Channel | int] = [self._channel]
+        if watched and self._descriptor is not None:
+            ends.append(self._descriptor)
+        try:
+            readable, _, _ = select.select(ends, [], [], wait)
+        except (OSError, ValueError):  # the link was closed, and says so when it is read
+            self._descriptor, self._came = None, True
+            self._clock.sleep_until(now + min(wait, LONGEST_TURN_S))
+            return
+        self._came |= self._descriptor in readable
 
     def _fault(self, error: BaseException) -> None:
         guard = self._guard
@@ -391,6 +399,7 @@ class Server:
         """Put the driver on its link: from here on it is polled."""
         self._gain = float(message["gain"])
         self._supply = make_supply(self._table, self._link, self._tell_wire, lambda: self._polled_at)
+        self._lent = self._supply if isinstance(self._supply, GivesBack) else None
         limits = Limits.of(self._scene)
         film = FilmLimits(self._scene.specimen.specimen(), limits)
         film.capacitance(0.0, 0.0)  # the model's first answer takes longest
@@ -433,7 +442,7 @@ class Server:
                 "ramp_duration": guard.ramp_duration,
                 "second_words": guard.second_words,
                 "given_back": guard.given_back,
-                "found": dict(supply.found) if isinstance(supply, GivesBack) else {},
+                "found": {} if self._lent is None else dict(self._lent.found),
                 "ready": supply.ready,
                 "identity": [supply.identity.model, supply.identity.serial, supply.identity.firmware],
                 "settings": supply.settings,
@@ -554,32 +563,6 @@ def _sentence(words: str) -> str:
 
 def _measured_off(guard: Guard) -> bool:
     return guard.state is GuardState.SAFE and guard.output_is_safe
-
-
-class LastWords:
-    """To the terminal, if there still is one. One that takes nothing (stopped by Ctrl-S) holds nobody up."""
-
-    def __init__(self) -> None:
-        self._unsaid = b""
-
-    def say(self, text: str) -> None:
-        """Say it as far as it can be said at once; `speak` says the rest."""
-        if os.name == "posix":
-            self._unsaid += f"{text}\n".encode()
-            self.speak()
-        else:  # there is no way to ask a console whether it would take it
-            with suppress(OSError, ValueError):
-                click.echo(text, err=True)
-
-    def speak(self) -> bool:
-        """Whether everything is said. Byte by byte: the room for one is all that a terminal promises."""
-        try:
-            while self._unsaid and select.select([], [STDERR], [], 0)[1]:
-                os.write(STDERR, self._unsaid[:1])
-                self._unsaid = self._unsaid[1:]
-        except (OSError, ValueError):  # nobody is there to hear it
-            self._unsaid = b""
-        return not self._unsaid
 
 
 def pack_error(error: BaseException) -> Message:

@@ -28,7 +28,8 @@ from rig.bench.tap import Tap
 from rig.log.recorder import Severity
 from rig.safety import process, start
 from rig.safety.channel import Channel, ChannelDamaged, Message
-from rig.safety.guard import AT_ONCE_S, Guard, GuardState, ramp_limit
+from rig.safety.commanded import ramp_limit
+from rig.safety.guard import AT_ONCE_S, Guard, GuardState
 from rig.safety.limits import FilmLimits, Limits
 from rig.safety.second import SecondReading
 from rig.safety.stopped import LOOK_S, Peer
@@ -40,7 +41,7 @@ START_S = 30.0  # until the process must have the link; a slow disk has many mod
 # loaded computer may take longer.
 SILENCE_S, ANSWER_S = 0.16, 0.25
 UNARMED_S = 2.0
-LATE_S = 0.02  # a turn that took longer than this is the host's fault: nobody listened
+LATE_S = 0.015  # a turn that comes later than this is the host's fault: nobody listened
 OPEN_AGAIN_S = 0.1
 GO_ON_S = 0.5  # how long to wait for the end of one that goes on trying, or hangs
 LEAVE_S = 5.0  # a guard that was told to go, and has nothing to take off, must have gone by then
@@ -89,7 +90,7 @@ class RemoteGuard:
         self._is_open = False
         self._heard_at = self._spoke_at = clock.now()  # the first goes on while nobody listens
         self._lost = ""  # why the process is lost
-        self._listened_at = clock.now()
+        self._next_listen = clock.now()
         self._successor: tuple[HVSupply, Guard] | None = None  # made ready; in charge once the guard is lost
         self._next_again = -math.inf
         self._lost_at: float | None = None  # since when our own link has been gone
@@ -199,12 +200,12 @@ class RemoteGuard:
         """
         if self._lost:
             return self._poll_ourselves(now)
-        self.next_poll = now + process.LONGEST_TURN_S
-        late = now - self._listened_at - LATE_S
+        late = now - self._next_listen - LATE_S
         if late > 0:
             self._heard_at = min(self._heard_at + late, now)
-        self._listened_at = now
         self._listen()
+        # What it sends is seen at the channel. A silence is looked at as soon as it may mean something.
+        self.next_poll = self._next_listen = max(self._spoke_at + LOOK_S, now + process.LONGEST_TURN_S)
         self._look_whether_stopped()
         if not self._lost and now - self._heard_at > (SILENCE_S if self.commanded else UNARMED_S):
             self._lose(f"it has said nothing for {now - self._heard_at:.2f} s")

@@ -14,11 +14,12 @@ import pytest
 from rig.bench.bench import Bench
 from rig.operator.control import Control
 from rig.run.backend import open_bench
-from rig.safety import process
+from rig.safety import last_words, process
 from rig.safety.channel import Channel
 from rig.safety.guard import SAFE_VOLTAGE, Guard, GuardState
 from rig.safety.heartbeat import Heartbeat
-from rig.safety.process import LastWords, Server
+from rig.safety.last_words import LastWords
+from rig.safety.process import Server
 from rig.safety.stopped import Peer
 from rig.scene.scene import load_scene
 from rig.sim.bench import SimulatedBench
@@ -260,7 +261,7 @@ def test_a_terminal_that_was_stopped_holds_nobody_up(monkeypatch: pytest.MonkeyP
     import termios
 
     screen, terminal = os.openpty()
-    monkeypatch.setattr(process, "STDERR", terminal)
+    monkeypatch.setattr(last_words, "STDERR", terminal)
     try:
         termios.tcflow(terminal, termios.TCOOFF)  # Ctrl-S
         voice = LastWords()

@@ -15,7 +15,7 @@ import pytest
 from drivers.dialogue import LOOK_AGAIN_S
 from rig.base.clock import RealClock
 from rig.bench.bench import Bench
-from rig.engine.attention import LONGEST_S, STREAM_S, Attention
+from rig.engine.attention import IDLE_S, LONGEST_S, STREAM_S, TOGETHER_S, Attention
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="descriptors that can be waited on are POSIX")
 SOON, LATE = 0.02, 1.0
@@ -65,6 +65,8 @@ def test_on_a_bench_in_memory_all_are_polled_in_every_turn(devices: dict[str, In
     attention, _ = attention_of(devices, "stage", "force")
     for now in (0.0, 1e-6, 1.0):
         assert list(attention.wanted(now)) == ["stage", "force"]
+    devices["stage"].next_poll = 2.0
+    assert attention.next() == (2.0, []) and attention.puts_off == 0.0
 
 
 def test_an_answer_that_another_one_has_read_is_looked_for_when_its_instrument_wishes(
@@ -133,10 +135,20 @@ def test_what_wants_to_be_polled_is_and_what_never_says_so_is_now_and_then(devic
     devices["stage"].next_poll = 1.004
     assert attention.wanted(1.003) == []
     assert attention.wanted(1.004) == ["stage"]
-    assert attention.next() == (1.004, [])
+    assert attention.next() == (1.004 + TOGETHER_S, [])
     devices["stage"].next_poll = devices["force"].next_poll = math.nan  # of a driver that cannot say when
     assert attention.wanted(1.0 + 0.9 * LONGEST_S) == []
     assert attention.wanted(1.0 + 1.1 * LONGEST_S) == ["stage", "force"]
+
+
+def test_who_waits_for_his_time_is_left_alone_until_then_but_not_for_long(devices: dict[str, Instrument]) -> None:
+    attention, _ = attention_of(devices)
+    for role, device in devices.items():
+        attention.polled(role, 1.0)
+        device.next_poll = 1.0 + 2 * IDLE_S
+    devices["force"].next_poll = math.inf
+    assert attention.wanted(1.0 + 0.9 * IDLE_S) == []
+    assert attention.wanted(1.0 + 1.1 * IDLE_S) == ["stage", "force"]
 
 
 def test_what_comes_unasked_or_streams_is_read_every_few_milliseconds(devices: dict[str, Instrument]) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from model.membrane.solve import solve
+from model.membrane.solve import Solution, solve
+from model.specimen import Specimen
 from rig.base.errors import LimitError
 from rig.base.toml_file import parse_table
 from rig.protocol.plan import plan
@@ -60,3 +62,25 @@ def test_straight_lines_are_those_of_numpy_to_the_bit() -> None:
         line = Line(x, y)
         for h in (*rng.uniform(-0.002, 0.017, 100), *x):
             assert line(float(h)) == float(np.interp(h, x, y))
+
+
+def test_the_capacitance_is_asked_again_once_the_film_has_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between two samples of a film at rest the model is not asked, and what it said is right to a thousandth."""
+    one = scene("")
+    film = FilmLimits(one.specimen.specimen(), Limits.of(one))
+    asked: list[tuple[float, float]] = []
+
+    def ask(specimen: Specimen, h: float, volts: float) -> Solution:
+        asked.append((h, volts))
+        return solve(specimen, h, volts)
+
+    monkeypatch.setattr("rig.safety.limits.solve", ask)
+    parallel = film.capacitance(8e-3, 1000.0) - solve(one.specimen.specimen(), 8e-3, 1000.0).capacitance()
+    for h, volts in ((8e-3, 1000.0), (8.001e-3, 1000.9), (7.999e-3, 999.1)):
+        truth = solve(one.specimen.specimen(), h, volts).capacitance() + parallel
+        assert film.capacitance(h, volts) == pytest.approx(truth, rel=1e-3)
+    assert asked == [(8e-3, 1000.0)]
+    for h, volts in ((8.003e-3, 1000.0), (8.003e-3, 1002.0)):
+        truth = solve(one.specimen.specimen(), h, volts).capacitance() + parallel
+        assert film.capacitance(h, volts) == pytest.approx(truth, rel=1e-12)
+    assert math.isnan(film.capacitance(math.nan, 0.0)) and len(asked) == 4
