@@ -75,7 +75,7 @@ def stays_off(stand: Stand, at: float) -> None:
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGKILL, signal.SIGSEGV, pytest.param(signal.SIGABRT, marks=pytest.mark.long)],
+    [signal.SIGKILL, *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGSEGV, signal.SIGABRT))],
 )
 def test_engine_killed(stand: Stand, live: Run, number: signal.Signals) -> None:
     at = stand.kill(live.engine, number)

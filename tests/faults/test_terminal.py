@@ -134,7 +134,10 @@ def test_the_terminal_is_closed(terminal: Terminal) -> None:
     check_off(terminal, at, log)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+# SIGHUP comes when a terminal is closed, above; what takes all of them: tests/rig/operator/test_signals.py.
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGHUP, signal.SIGQUIT))]
+)
 def test_a_signal_from_outside(terminal: Terminal, number: signal.Signals) -> None:
     at = terminal.stand.bench.clock.now()
     terminal.process.send_signal(number)
@@ -143,8 +146,9 @@ def test_a_signal_from_outside(terminal: Terminal, number: signal.Signals) -> No
     assert terminal.process.returncode == 130 and words(log)[-1] == "switch_off"
 
 
+@pytest.mark.long
 def test_the_run_is_killed(terminal: Terminal) -> None:
-    """As in `test_processes`, with everything as the command line starts it."""
+    """As in `test_processes`, with everything as the command line starts it; so does `test_serial_supply` in CI."""
     stand = terminal.stand
     at = stand.bench.clock.now()
     terminal.process.kill()

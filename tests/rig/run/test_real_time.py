@@ -99,14 +99,9 @@ def test_without_arm_there_is_no_high_voltage_and_no_log(scene: Path, ports: Pat
 
 
 @pytest.mark.slow
-# The others in CI: `tests/faults/test_terminal.py`, SIGINT there by its key.
-@pytest.mark.parametrize(
-    "number",
-    [
-        signal.SIGTERM,
-        *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)),
-    ],
-)
+# In CI: `tests/faults/test_terminal.py`, SIGINT there by its key, and `tests/rig/operator/test_signals.py`.
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
 def test_a_signal_ends_a_run_safely(
     scene: Path, live_soon: Path, ports: Path, tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -158,23 +158,8 @@ def outcome(log: Path) -> tuple[Log, dict[str, Any]]:
     return found, dict(found.outcome or {})
 
 
-def test_stop_from_another_terminal_ends_it_safely_and_says_who(bench: Bench) -> None:
-    run, log = bench.run("stopped.mcap")
-    pid = in_midst(bench, run, log)
-    done = dea_rig("stop")
-    assert done.returncode == 0, done.stdout + done.stderr
-    said, _ = run.communicate(timeout=WAIT_S)
-    assert run.returncode == 130, said
-    assert bench.served.voltage() < 60.0
-    wait(lambda: not lives(pid), "the end of the process that fits")
-    found, how = outcome(log)
-    assert (how["status"], how["safe"]) == ("stopped", "yes")
-    (who,) = [message.fields for message in found.messages("/operator") if message.fields["act"] == "stops"]
-    assert who["by"] == "another terminal"
-    assert list(found.messages("/decision"))
-
-
-def test_a_killed_engine_leaves_no_voltage_no_fit_and_a_run_that_goes_on(bench: Bench) -> None:
+def test_a_killed_engine_leaves_no_voltage_no_fit_and_a_run_that_goes_on_until_it_is_stopped(bench: Bench) -> None:
+    """The rest is stopped from another terminal, in the midst of it too."""
     run, log = bench.run("killed.mcap")
     pid = in_midst(bench, run, log)
     run.send_signal(signal.SIGKILL)
@@ -192,17 +177,19 @@ def test_a_killed_engine_leaves_no_voltage_no_fit_and_a_run_that_goes_on(bench: 
     rest = bench.folder / "rest.mcap"
     again = bench.start("resume", whole, "-o", rest, "--clear")
 
-    def goes_on() -> bool:
-        assert again.poll() is None, again.communicate()[0]
-        return len(decisions(rest)) > 0
-
-    wait(goes_on, "the next decision")
-    assert decisions(rest)[0]["number"] == before[-1]["number"] + 1
-    assert decisions(rest)[0]["spent_s"] > before[-1]["spent_s"]
-    assert dea_rig("stop").returncode == 0
-    again.communicate(timeout=WAIT_S)
+    pid = in_midst(bench, again, rest)
+    first, last = decisions(rest)[0], before[-1]
+    assert first["number"] == last["number"] + 1 and first["spent_s"] > last["spent_s"]
+    done = dea_rig("stop")
+    assert done.returncode == 0, done.stdout + done.stderr
+    said, _ = again.communicate(timeout=WAIT_S)
+    assert again.returncode == 130, said
     assert bench.served.voltage() < 60.0
-    assert outcome(rest)[1]["safe"] == "yes"
+    wait(lambda: not lives(pid), "the end of the process that fits")
+    found, how = outcome(rest)
+    assert (how["status"], how["safe"]) == ("stopped", "yes")
+    (who,) = [message.fields for message in found.messages("/operator") if message.fields["act"] == "stops"]
+    assert who["by"] == "another terminal"
 
 
 @pytest.mark.long
