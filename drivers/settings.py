@@ -23,10 +23,11 @@ NotNegative = Annotated[float, Field(ge=0)]
 class Table(BaseModel):
     """A TOML table: strict types, no unknown keys, no NaN or inf.
 
-    Keys carry their unit (``thickness_um``) and a description; lists are ``list``, never tuples.
+    Keys carry their unit (``thickness_um``) and a description; lists are ``list``, never tuples. What checks a table is
+    built when the first of its kind is read: most programs read few of the many kinds, and a guard starts sooner.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, defer_build=True)
 
 
 class InstrumentSettings(Table):

@@ -139,7 +139,7 @@ RANGE = "Calibrated range, lower and higher end; nothing is measured beyond it."
 class BudgetLine(BaseModel):
     """One component of the gain's uncertainty; for people, it changes nothing."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, defer_build=True)
 
     component: Text = Field(description="Name of the component of uncertainty.")
     type: Literal["A", "B"] = Field(description="A: evaluated from repeated readings. B: from other knowledge (GUM).")
@@ -150,7 +150,7 @@ class BudgetLine(BaseModel):
 class AnyFile(BaseModel):
     """What every certificate file has."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, defer_build=True)
 
     format: Literal["dea-rig certificate 1"] = Field(description="Which format the file has.")
     instrument: Text = Field(description="Make and model of the instrument that was calibrated.")
