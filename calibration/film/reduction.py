@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,8 @@ def select(curves: Sequence[Curve], material: Material, wrinkling: Wrinkling = "
 
     With "plain" only the taut film is described: of each curve the stretch of displacements with the most samples in
     which the film is taut throughout is kept. With "tension_field" wrinkled states are described too; a curve is cut
-    where wrinkles begin or end, because the force has a kink of higher order there.
+    where wrinkles begin or end, because the force has a kink of higher order there. A part without a state at the
+    voltage of its own samples, at one of its ends, is left out too.
     """
     given = [_given(curve) for curve in curves]
     rows = [i for i, (used, _) in enumerate(given) if used.any()]
@@ -116,7 +117,28 @@ def select(curves: Sequence[Curve], material: Material, wrinkling: Wrinkling = "
             continue
         row = rows.index(i)
         found.append(_divide(curve, used, excluded, grids[row], status[row], wrinkling))
-    return found
+    return _with_states(curves, found, material, wrinkling)
+
+
+def _with_states(
+    curves: Sequence[Curve], selections: list[Selection], material: Material, wrinkling: Wrinkling
+) -> list[Selection]:
+    """Leave out parts without a state: the voltage of the few samples of a part may be above that of the curve."""
+    parts = [(i, part) for i, selection in enumerate(selections) for part in selection.parts]
+    if not parts:
+        return selections
+    films = np.empty((len(parts), 1), dtype=np.object_)
+    films[:, 0] = [curves[i].specimen.with_material(material) for i, _ in parts]
+    ends = np.array([(part.low, part.high) for _, part in parts])
+    voltage = np.array([[reference_voltage(curves[i], part.used)] for i, part in parts])
+    without = ~np.isfinite(solve_many(films, ends, voltage, wrinkling=wrinkling).force).all(axis=1)
+    for (i, part), gone in zip(parts, without, strict=True):
+        if gone:
+            one = selections[i]
+            excluded = dict(one.excluded)
+            _count(excluded, "no state at the voltage of these samples", part.used)
+            selections[i] = replace(one, parts=tuple(p for p in one.parts if p is not part), excluded=excluded)
+    return selections
 
 
 def _given(curve: Curve) -> tuple[NDArray[np.bool_], dict[str, int]]:

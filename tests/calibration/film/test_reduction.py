@@ -17,7 +17,7 @@ from calibration.film.reduction import (
     reduce,
     select,
 )
-from model.material.materials import NAMED
+from model.material.materials import NAMED, Material
 from model.membrane.solve import Status, solve_many
 from model.specimen import Specimen
 
@@ -154,6 +154,23 @@ def test_wrinkled_samples_are_left_out_and_counted() -> None:
     assert selection.excluded.get("wrinkled", 0) > 0
     lost = (status == Status.TAUT).sum() - selection.used.sum()
     assert lost <= 2 * h.size / 32, "at most one step of the grid is given away on either side"
+
+
+def test_a_part_without_a_state_at_the_voltage_of_its_own_samples_is_left_out() -> None:
+    """Close to the slack voltage of the flat film: the curve's mean voltage is below it, that of the first few above."""
+    film = Specimen(4e-3, 20e-3, 40e-6, 1.2, Material("soft", (22143.514,), (7.2158711,), 3.133153))
+    h = np.concatenate([np.linspace(5.02e-5, 5.03e-5, 5), np.linspace(0.3e-3, 4e-3, 200)])
+    curve = plain_curve(h, np.zeros(h.size), 1500.0, film)
+    voltage = np.full(h.size, 1499.8)
+    voltage[:5] = 1504.0
+    mean = float(np.sqrt(np.mean(voltage**2)))
+    assert np.isfinite(solve_many(film, h[0], mean).force) and not np.isfinite(solve_many(film, h[0], 1504.0).force)
+    selection = select([replace(curve, voltage=voltage)], film.material)[0]
+    for part in selection.parts:
+        at = float(np.sqrt(np.mean(voltage[part.used] ** 2)))
+        assert np.isfinite(solve_many(film, [part.low, part.high], at).force).all()
+    assert sum(selection.excluded.values()) == h.size - selection.used.sum()
+    assert selection.excluded["no state at the voltage of these samples"] == 5
 
 
 def test_samples_without_value_flagged_before_contact_or_off_voltage_are_counted_apart() -> None:
