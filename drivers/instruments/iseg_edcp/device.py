@@ -21,11 +21,6 @@ from drivers.instruments.iseg_edcp.codec import (
     Message,
     ModuleStatus,
     Value,
-    hv_flags,
-    identity,
-    log_on,
-    read_many,
-    read_request,
     write,
 )
 from drivers.instruments.iseg_edcp.exchange import (
@@ -46,12 +41,7 @@ from drivers.instruments.iseg_edcp.exchange import (
 )
 from drivers.instruments.iseg_edcp.protection import Protection
 from drivers.links.link import CanFrame, DeviceError, DeviceRefused, DeviceSilent, FrameLink
-from drivers.roles import HVFlag, HVSample, Identity
-
-# What a channel's own status says of an error of this channel; each of them also costs the module its "no sum error".
-CHANNEL_ERRORS = (
-    HVFlag.TRIPPED | HVFlag.ARC | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.VOLTAGE_LIMIT | HVFlag.CURRENT_LIMIT
-)
+from drivers.roles import HVSample, Identity
 
 T = TypeVar("T")
 
@@ -263,14 +253,14 @@ class IsegEDCP:
             message = self._decoder.feed(self._inbox.popleft())
             if isinstance(message, LogOn):
                 self.counters["log_ons"] += 1
-                self._link.write(log_on(self._module))
+                self._link.write(edcp.log_on(self._module))
                 self._lost_settings = True  # it may have been switched off and on, and lost what was set
             elif message is not None and not self._dialogue.offer(message, now) and not self._collect(message):
                 self.counters["unexpected_frames"] += 1
                 judge_second(self._label, self._module, self.identity.serial, message)
         if self._dialogue.idle:
             if not self._ready:
-                self._link.write(log_on(self._module))
+                self._link.write(edcp.log_on(self._module))
                 self._dialogue.begin(self._set_up())
             elif self._schedule.take(now):
                 self._dialogue.begin(self._cycle(now))
@@ -319,9 +309,9 @@ class IsegEDCP:
         self._exchange = exchange
         self._collected = {}
         if exchange.everyone:
-            self._link.write(read_many(self._module, exchange.item, exchange.everyone))
+            self._link.write(edcp.read_many(self._module, exchange.item, exchange.everyone))
             return self._completes
-        self._link.write(read_request(self._module, exchange.item, exchange.channel))
+        self._link.write(edcp.read_request(self._module, exchange.item, exchange.channel))
         return lambda m: isinstance(m, Data) and m.item is exchange.item and m.channel == exchange.channel
 
     def _completes(self, message: Message) -> bool:
@@ -393,7 +383,7 @@ class IsegEDCP:
                 "Writes could not be verified. End the other program, or switch receive_own_messages off.",
             )
         serial = yield from self._optional(edcp.SERIAL_NUMBER, repeat=True)
-        self.identity = identity(serial, None, None)
+        self.identity = edcp.identity(serial, None, None)
         release = yield from self._optional(edcp.FIRMWARE_RELEASE)
         firmware = yield from self._optional(edcp.FIRMWARE_NAME)
         channels = yield from self._optional(edcp.CHANNEL_COUNT)
@@ -404,7 +394,7 @@ class IsegEDCP:
                 f"module {self._module} has {channels} channel(s), but channel {self._channel} was asked for",
                 f"Channels count from 0: allowed is 0 to {channels - 1}.",
             )
-        self.identity = identity(serial, release, firmware)
+        self.identity = edcp.identity(serial, release, firmware)
         volts, _ = yield from self._number(edcp.NOMINAL_VOLTAGE, 1e6)
         amperes, _ = yield from self._number(edcp.NOMINAL_CURRENT, 1e3)
         if not (volts != 0 and amperes != 0):
@@ -447,17 +437,15 @@ class IsegEDCP:
         voltage, t = yield from self._number(edcp.MEASURED_VOLTAGE, 2 * volts)
         current, _ = yield from self._number(edcp.MEASURED_CURRENT, 10 * amperes)
         setpoint, _ = yield from self._number(edcp.SET_VOLTAGE, 2 * volts)
-        status = yield from self._integer(edcp.CHANNEL_STATUS)
-        if status & ChannelStatus.EMERGENCY_OFF and not status & ChannelStatus.ON:
-            self._emergency_until_confirmed = False
-        events = yield from self._integer(edcp.CHANNEL_EVENTS)
-        module = yield from self._integer(edcp.MODULE_STATUS)
-        flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module), self._bit_5)
-        if not module & ModuleStatus.NO_SUM_ERROR and not flags & CHANNEL_ERRORS:
-            # Some channel has an error. If it is this one, it came after its status was asked: a trip is no fault.
+        for _ in range(2):  # an error that comes between channel and module is this channel's: a trip, and no fault
             status = yield from self._integer(edcp.CHANNEL_STATUS)
             events = yield from self._integer(edcp.CHANNEL_EVENTS)
-            flags = hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module), self._bit_5)
+            module = yield from self._integer(edcp.MODULE_STATUS)
+            flags = edcp.hv_flags(ChannelStatus(status), ChannelEvents(events), ModuleStatus(module), self._bit_5)
+            if module & ModuleStatus.NO_SUM_ERROR or flags & edcp.CHANNEL_ERRORS:
+                break
+        if status & ChannelStatus.EMERGENCY_OFF and not status & ChannelStatus.ON:
+            self._emergency_until_confirmed = False
         if self._sign < 0:  # with which sign a negative channel states them is not settled: magnitudes
             voltage, current, setpoint = abs(voltage), abs(current), abs(setpoint)
         self._samples.append(HVSample(t, voltage, current, setpoint, flags))

@@ -157,7 +157,7 @@ def test_wrinkled_samples_are_left_out_and_counted() -> None:
 
 
 def test_a_part_without_a_state_at_the_voltage_of_its_own_samples_is_left_out() -> None:
-    """Close to the slack voltage of the flat film: the curve's mean voltage is below it, that of the first few above."""
+    """Close to the slack voltage of the flat film: the curve's mean is below it, that of the first few above."""
     film = Specimen(4e-3, 20e-3, 40e-6, 1.2, Material("soft", (22143.514,), (7.2158711,), 3.133153))
     h = np.concatenate([np.linspace(5.02e-5, 5.03e-5, 5), np.linspace(0.3e-3, 4e-3, 200)])
     curve = plain_curve(h, np.zeros(h.size), 1500.0, film)
