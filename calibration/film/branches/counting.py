@@ -20,6 +20,7 @@ from calibration.film.branches.result import FAR, LeftOut
 Array = NDArray[np.float64]
 
 EARNED = 7.0  # by which AICc must fall for another branch
+CLEAR = 60.0  # of AICc: a gain that neither chance nor an unfinished search explains
 PREDICTED = 1.02  # what is left out may be predicted worse by this factor at most
 MOST = 3  # branches that are looked for
 PER_DECADE = 4  # relaxation times that a search tries

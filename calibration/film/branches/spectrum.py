@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.branches.counting import (
+    CLEAR,
     DECADES_BEYOND,
     EARNED,
     MOST,
@@ -131,6 +132,7 @@ class _Counting:
     def __init__(self, joint: Joint, start: Array, wanted: int | None) -> None:
         self.joint, self.scale = joint, 1.0
         self.fits = [_Fit(joint.fit(start), joint.state)]
+        accepted = 0
         for number in range(1, (MOST if wanted is None else wanted) + 1):
             joint.state = self.fits[-1].state
             joint.within = np.ones_like(joint.kept)
@@ -140,11 +142,13 @@ class _Counting:
             more = _Fit(point, joint.state)
             self.keep(joint.kept)
             joint.state = more.state
-            scale, earned = pays(joint, self.fits[-1].point, point)
-            if wanted is None and not earned:
-                break
-            self.scale = scale
+            scale, earned = pays(joint, self.fits[accepted].point, point)
             self.fits.append(more)
+            if wanted is not None or earned:
+                self.scale, accepted = scale, number
+            elif number > accepted + 1 or not gain(joint, self.fits[accepted].point, point, scale) > CLEAR:
+                break  # else it explains much and predicts badly, as one branch does where two are missing: one more
+        self.fits = self.fits[: accepted + 1]
         joint.state = self.fits[-1].state
 
     def keep(self, kept: NDArray[np.bool_]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.film.branches.counting import (
+    CLEAR,
     DECADES_BEYOND,
     MOST,
     Count,
@@ -26,8 +27,6 @@ from calibration.film.branches.counting import (
 from calibration.sheet.timed.problem import Point, TimedProblem
 
 Array = NDArray[np.float64]
-
-CLEAR = 60.0  # of AICc: a gain that no unfinished search explains
 
 
 def guess(problem: TimedProblem, from_: Point, number: int) -> Array | None:
@@ -62,9 +61,9 @@ def guess(problem: TimedProblem, from_: Point, number: int) -> Array | None:
 def count_branches(problem: TimedProblem, start: Array, wanted: int | None) -> list[Count[Point]]:
     """The sheet with 0, 1, ... branches up to those that pay, or without and with as many as are ``wanted``."""
     points = [problem.minimise(start)]
-    scale = 1.0
+    scale, accepted = 1.0, 0
     for number in range(1, (MOST if wanted is None else wanted) + 1):
-        fewer = points[-1]
+        fewer = points[accepted]
         begin = guess(problem, fewer, number)
         if begin is None:
             break
@@ -75,13 +74,15 @@ def count_branches(problem: TimedProblem, start: Array, wanted: int | None) -> l
             film = problem.split(point.x)[0]
             other = np.concatenate((film, fewer.x[film.size :]))
             ends = [problem.minimise(start, last=True) for start in (fewer.x, other)]
-            points[-1] = fewer = min(ends, key=lambda one: one.cost)
+            points[accepted] = fewer = min(ends, key=lambda one: one.cost)
             point = problem.minimise(point.x, last=True)
             found, earned = pays(problem, fewer, point)
-        if wanted is None and not earned:
-            break
-        scale = found
         points.append(point)
+        if wanted is not None or earned:
+            scale, accepted = found, number
+        elif number > accepted + 1 or not gain(problem, fewer, point, found) > CLEAR:
+            break  # else it explains much and predicts badly, as one branch does where two are missing: one more
+    points = points[: accepted + 1]
     return counted(problem, points, scale)
 
 

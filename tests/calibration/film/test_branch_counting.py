@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration.film.branches import spectrum
 from calibration.film.branches.counting import hidden, left_out, shifted
 from calibration.film.branches.result import FoundBranch, Known, LeftOut
 
@@ -128,3 +129,35 @@ def test_the_verdict_is_that_of_the_combined_figure() -> None:
     assert shaken.ratio_uncertainty == pytest.approx(math.hypot(0.01, 0.2))
     unsure = FoundBranch.judged(Known(1.0, 0.3, 0.2, 0.1), log_time, WINDOW, explained=True)
     assert (unsure.verdict, unsure.hidden) == ("bounded", 0.0)
+
+
+class Fits:
+    """A joint fit of which only the order of the questions matters; its points are numbers of branches."""
+
+    def __init__(self) -> None:
+        self.kept = np.ones(3, dtype=np.bool_)
+        self.within = self.kept
+        self.state = (None, None, self.kept)
+
+    def fit(self, start: object) -> object:
+        return start
+
+
+@pytest.mark.parametrize(
+    ("gains", "earned", "number"),
+    [
+        ({1: 500.0, 2: 900.0}, {2}, 2),  # one explains much and predicts badly, as where two are missing
+        ({1: 500.0, 2: 900.0, 3: 950.0}, {3}, 0),  # but no more than one is passed over
+        ({1: 20.0, 2: 900.0}, {2}, 0),  # one that explains little ends the search
+        ({1: 500.0, 2: 900.0, 3: 8.0}, {1, 2}, 2),
+        ({1: 500.0, 2: 900.0, 3: 990.0}, {1, 3}, 3),
+    ],
+)
+def test_a_branch_that_predicts_badly_alone_is_passed_over_once(
+    monkeypatch: pytest.MonkeyPatch, gains: dict[int, float], earned: set[int], number: int
+) -> None:
+    monkeypatch.setattr(spectrum, "_fitted", lambda joint, points, number: number if number in gains else None)
+    monkeypatch.setattr(spectrum, "gain", lambda joint, fewer, more, scale: gains[more])
+    monkeypatch.setattr(spectrum, "pays", lambda joint, fewer, more: (1.0, more in earned))
+    counting = spectrum._Counting(Fits(), 0, None)  # type: ignore[arg-type]
+    assert [one.point for one in counting.fits] == list(range(number + 1))
