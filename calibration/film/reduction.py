@@ -131,9 +131,9 @@ def _with_states(
     films[:, 0] = [curves[i].specimen.with_material(material) for i, _ in parts]
     ends = np.array([(part.low, part.high) for _, part in parts])
     voltage = np.array([[reference_voltage(curves[i], part.used)] for i, part in parts])
-    without = ~np.isfinite(solve_many(films, ends, voltage, wrinkling=wrinkling).force).all(axis=1)
-    for (i, part), gone in zip(parts, without, strict=True):
-        if gone:
+    force = solve_many(films, ends, voltage, wrinkling=wrinkling).force
+    for (i, part), at_ends in zip(parts, force, strict=True):
+        if not np.isfinite(at_ends).all():
             one = selections[i]
             excluded = dict(one.excluded)
             _count(excluded, "no state at the voltage of these samples", part.used)
