@@ -178,6 +178,11 @@ class Decoder:
         """Accept measured frames of every shape."""
         self._expected = self._floats = None
 
+    def drop(self) -> None:
+        """Give up what is held back: a frame whose rest is not coming swallows the answers that come in its place."""
+        self.counters["dropped_bytes"] += len(self._buffer)
+        self._buffer = b""
+
     def feed(self, data: bytes) -> list[Message]:
         """Frames completed by ``data``, in order."""
         buffer = self._buffer + data

@@ -168,6 +168,7 @@ class GSV8:
         self._stream: Stream[ForceSample] | None = None
         self._fresh = True
         self._inbox: deque[Message] = deque()
+        self._asked: _Request | None = None
         self._next_poll = -math.inf
 
     @property
@@ -272,6 +273,9 @@ class GSV8:
     # -- dialogue ---------------------------------------------------------------------------------------------------
 
     def _transmit(self, request: _Request) -> _Recogniser:
+        if request is self._asked:  # once more: nothing came within the time that an answer takes
+            self._decoder.drop()
+        self._asked = request
         self._link.write(encode(request.command, request.parameters))
         return _Recogniser(request)
 

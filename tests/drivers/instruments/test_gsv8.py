@@ -313,6 +313,24 @@ class Rig:
         return self
 
 
+class CutShort(Amplifier):
+    """Its stream ends in the middle of a frame, as behind a port whose buffer was full."""
+
+    def write(self, data: bytes) -> None:
+        if data[2] == gsv8.STOP_TRANSMISSION and self.streaming:
+            self.out += self.frame(0)[:20]
+        super().write(data)
+
+
+def test_a_frame_whose_rest_never_comes_swallows_one_answer_at_most() -> None:
+    rig = Rig(timeout_s=0.05)
+    rig.amp = CutShort()
+    rig.until_ready()
+    assert rig.sensor.counters["retries"] == 1
+    rig.run(1.0)
+    assert len(rig.samples) == pytest.approx(rig.sensor.rate, rel=0.05)
+
+
 def test_it_is_a_force_sensor() -> None:
     sensor: ForceSensor = GSV8("force", Amplifier())
     assert sensor.reading_unit == "mV/V"
