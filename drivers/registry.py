@@ -43,7 +43,10 @@ def registered() -> Registered:
     for entry in entry_points(group=GROUP):
         package = entry.dist.name if entry.dist is not None else entry.value
         try:
-            _add(found, _declared_in(_load(entry)))
+            declared = _declared_in(_load(entry))
+            for one in declared:
+                one.settings.model_rebuild()  # keys that cannot be: told here, not to whoever reads a scene
+            _add(found, declared)
         except Exception as error:  # whatever a package does on import must not stop a run that does not need it
             found.broken.append(f"Package {package} registers instruments, but cannot be used: {error!r}.")
     return found

@@ -123,6 +123,7 @@ SPOILT = {
     "knock": ("import no_such_module_at_all\n", "no_such_module_at_all"),
     "rap": ("Knock = 7\n", "is no rig.steps.base.Step"),
     "bang": (STEP.replace('"knock"', '"tap"'), "its `do` is 'tap'"),
+    "thud": (STEP.replace('"knock"', '"thud"').replace("depth_mm: Positive", "depth_mm: type(Step.plan)"), "schema"),
 }
 
 

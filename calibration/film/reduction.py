@@ -95,8 +95,8 @@ def select(curves: Sequence[Curve], material: Material, wrinkling: Wrinkling = "
 
     With "plain" only the taut film is described: of each curve the stretch of displacements with the most samples in
     which the film is taut throughout is kept. With "tension_field" wrinkled states are described too; a curve is cut
-    where wrinkles begin or end, because the force has a kink of higher order there. A part without a state at the
-    voltage of its own samples, at one of its ends, is left out too.
+    where wrinkles begin or end, because the force has a kink of higher order there. Of a part without a state at one
+    of its ends, at the voltage of its own samples, what lies between ends that have one is kept.
     """
     given = [_given(curve) for curve in curves]
     rows = [i for i, (used, _) in enumerate(given) if used.any()]
@@ -123,7 +123,7 @@ def select(curves: Sequence[Curve], material: Material, wrinkling: Wrinkling = "
 def _with_states(
     curves: Sequence[Curve], selections: list[Selection], material: Material, wrinkling: Wrinkling
 ) -> list[Selection]:
-    """Leave out parts without a state: the voltage of the few samples of a part may be above that of the curve."""
+    """Leave out what has no state: the voltage of the few samples of a part may be above that of the curve."""
     parts = [(i, part) for i, selection in enumerate(selections) for part in selection.parts]
     if not parts:
         return selections
@@ -134,11 +134,37 @@ def _with_states(
     force = solve_many(films, ends, voltage, wrinkling=wrinkling).force
     for (i, part), at_ends in zip(parts, force, strict=True):
         if not np.isfinite(at_ends).all():
+            rest = _with_state(curves[i], part, material, wrinkling)
+            left = part.used if rest is None else part.used & ~rest.used
             one = selections[i]
             excluded = dict(one.excluded)
-            _count(excluded, "no state at the voltage of these samples", part.used)
-            selections[i] = replace(one, parts=tuple(p for p in one.parts if p is not part), excluded=excluded)
+            _count(excluded, "no state at the voltage of these samples", left)
+            kept = tuple(p if p is not part else rest for p in one.parts)
+            selections[i] = replace(one, parts=tuple(p for p in kept if p is not None), excluded=excluded)
     return selections
+
+
+def _with_state(curve: Curve, part: Part, material: Material, wrinkling: Wrinkling) -> Part | None:
+    """What of a part is left between ends that have a state at the voltage of the samples between them."""
+    film = curve.specimen.with_material(material)
+    left: Part | None = part
+    while left is not None:
+        grid = np.linspace(left.low, left.high, GRID)
+        voltage = reference_voltage(curve, left.used)
+        there = np.isfinite(solve_many(film, grid, voltage, wrinkling=wrinkling).force)
+        if there[0] and there[-1]:
+            break
+        first, last = _longest(there, curve.place[left.used], grid)
+        left = _part(curve, left.used & (curve.place >= first) & (curve.place <= last))
+    return left
+
+
+def _part(curve: Curve, used: NDArray[np.bool_]) -> Part | None:
+    """The samples ``used`` as a part; None where there are none."""
+    if not used.any():
+        return None
+    least = float(curve.place[used].min())
+    return Part(used, least, max(float(curve.place[used].max()), least + 1e-9))
 
 
 def _given(curve: Curve) -> tuple[NDArray[np.bool_], dict[str, int]]:
@@ -191,9 +217,8 @@ def _divide(
     parts = []
     for low, high in itertools.pairwise(cuts):
         used = inside & (curve.place >= low) & ((curve.place < high) if high < last else (curve.place <= high))
-        if used.any():
-            least = float(curve.place[used].min())
-            parts.append(Part(used, least, max(float(curve.place[used].max()), least + 1e-9)))
+        if (part := _part(curve, used)) is not None:
+            parts.append(part)
     return Selection(tuple(parts), excluded, curve.h.size, wrinkled)
 
 

@@ -292,8 +292,9 @@ class Server:
         self._tick_log(now)
         due, watched = now + LONGEST_TURN_S, False
         if self._guard is not None and self._supply is not None:
-            look = self._guard.next_look
-            due = min(self._due(self._guard, self._supply), self._next_alive, look if look > now else due)
+            # What is overdue already was tried in the turn before; it may go on failing, and is no cause for haste.
+            instants = self._next_alive, self._guard.next_look
+            due = min(self._due(self._guard, self._supply), *(at if at > now else due for at in instants))
             unasked = self._polled_at + LONGEST_TURN_S  # what comes unasked, on a full bus, is not read one by one
             watched = now >= unasked or self._awaits(self._supply)
             due = due if watched else min(due, unasked)

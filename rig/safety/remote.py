@@ -365,7 +365,9 @@ class RemoteGuard:
             case "answer":
                 self._answers[message["n"]] = message["error"]
             case "error":
-                self._errors.append(unpack_error(message["error"]))
+                error = unpack_error(message["error"])
+                if not self._errors or str(self._errors[-1]) != str(error):  # a port that is gone is told every turn
+                    self._errors.append(error)
             case "opened":
                 self._is_open = True
                 self.link_settings = message["settings"] | getattr(self._link, "settings", {})

@@ -121,6 +121,8 @@ def _load(name: str) -> type[Step] | None:
     advice = "Update or remove that package."
     try:
         step = entry.load()
+        if isinstance(step, type) and issubclass(step, Step):
+            step.model_rebuild()  # keys that cannot be: told here
     except Exception as error:  # whatever another package's code does when it is imported
         raise ConfigError(
             f"The step {name!r} of the package {package} ({entry.value}) cannot be loaded: {error!r}. {advice}"

@@ -132,7 +132,7 @@ class _Counting:
     def __init__(self, joint: Joint, start: Array, wanted: int | None) -> None:
         self.joint, self.scale = joint, 1.0
         self.fits = [_Fit(joint.fit(start), joint.state)]
-        accepted = 0
+        accepted, answer = 0, self.fits
         for number in range(1, (MOST if wanted is None else wanted) + 1):
             joint.state = self.fits[-1].state
             joint.within = np.ones_like(joint.kept)
@@ -143,12 +143,17 @@ class _Counting:
             self.keep(joint.kept)
             joint.state = more.state
             scale, earned = pays(joint, self.fits[accepted].point, point)
-            self.fits.append(more)
+            before, self.fits = self.fits, [*self.fits, more]
             if wanted is not None or earned:
-                self.scale, accepted = scale, number
-            elif number > accepted + 1 or not gain(joint, self.fits[accepted].point, point, scale) > CLEAR:
-                break  # else it explains much and predicts badly, as one branch does where two are missing: one more
-        self.fits = self.fits[: accepted + 1]
+                self.scale, accepted, answer = scale, number, self.fits
+                continue
+            if number > accepted + 1:
+                break
+            answer = before
+            # Where it explains much and predicts badly, as one branch does where two are missing, two are tried.
+            if not gain(joint, before[accepted].point, point, scale) > CLEAR:
+                break
+        self.fits = answer
         joint.state = self.fits[-1].state
 
     def keep(self, kept: NDArray[np.bool_]) -> None:

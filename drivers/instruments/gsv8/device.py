@@ -273,7 +273,7 @@ class GSV8:
     # -- dialogue ---------------------------------------------------------------------------------------------------
 
     def _transmit(self, request: _Request) -> _Recogniser:
-        if request is self._asked:  # once more: nothing came within the time that an answer takes
+        if request is self._asked and self._stream is None:  # once more: nothing came in the time that an answer takes
             self._decoder.drop()
         self._asked = request
         self._link.write(encode(request.command, request.parameters))

@@ -293,10 +293,8 @@ class Decoder:
         return None
 
 
-# What a channel's own status says of an error of this channel; each of them also costs the module its "no sum error".
-CHANNEL_ERRORS = (
-    HVFlag.TRIPPED | HVFlag.ARC | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF | HVFlag.VOLTAGE_LIMIT | HVFlag.CURRENT_LIMIT
-)
+# What a channel's own status says of why this channel is off. A limit that it is at is no reason: a trip may follow.
+CHANNEL_ERRORS = HVFlag.TRIPPED | HVFlag.ARC | HVFlag.INHIBITED | HVFlag.EMERGENCY_OFF
 
 STATUS_BIT_5 = ("unused", "limit good", "input error")
 """What bit 5 of the module status may mean, by the class of the module."""

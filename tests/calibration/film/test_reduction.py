@@ -173,6 +173,21 @@ def test_a_part_without_a_state_at_the_voltage_of_its_own_samples_is_left_out() 
     assert selection.excluded["no state at the voltage of these samples"] == 5
 
 
+def test_of_a_part_without_a_state_at_one_end_the_rest_is_kept() -> None:
+    """The wrinkled part was recorded at more voltage than the taut one: at its beginning the film hangs slack then."""
+    film = Specimen(4e-3, 20e-3, 40e-6, 1.2, Material("film", (37834.0,), (5.4985,), 1.7))
+    h = np.concatenate([np.linspace(0.1e-3, 3e-3, 300), np.linspace(3e-3, 14e-3, 200)])
+    voltage = np.repeat((2000.0, 2400.0), (300, 200))
+    curve = replace(plain_curve(h, np.zeros(h.size), 2200.0, film), voltage=voltage)
+    selection = select([curve], film.material, "tension_field")[0]
+    last = selection.parts[-1]
+    at = float(np.sqrt(np.mean(voltage[last.used] ** 2)))
+    assert 3.2e-3 < last.low < 7e-3 and last.high == 14e-3
+    assert np.isfinite(solve_many(film, [last.low, last.high], at, wrinkling="tension_field").force).all()
+    assert 0 < selection.excluded["no state at the voltage of these samples"] < 200
+    assert sum(selection.excluded.values()) == h.size - selection.used.sum()
+
+
 def test_samples_without_value_flagged_before_contact_or_off_voltage_are_counted_apart() -> None:
     h = np.linspace(-1e-3, 12e-3, 131)  # ten below zero, one at it
     curve = plain_curve(h, np.zeros(h.size), 1000.0)

@@ -98,9 +98,9 @@ def iseg_byte_order(patch):
 
 def iseg_flags(patch):
     patch.setattr(
-        drivers.instruments.iseg_edcp.device,
+        drivers.instruments.iseg_edcp.codec,
         "hv_flags",
-        lambda status, events, module: drivers.roles.HVFlag(0),
+        lambda status, events, module, bit_5: drivers.roles.HVFlag(0),
     )
 
 
