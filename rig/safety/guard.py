@@ -110,7 +110,7 @@ class Guard:
         self._deviating_samples = 0
         self._equal_samples = 0
         self._equal_since: tuple[HVSample, bool] | None = None  # and whether the output was to move
-        self._seen_on = False
+        self._seen_on = self._was_up = False  # in this arming: the channel on, and an output where its ramp has it
         self._commanded: CommandedRamp | None = None  # what the output was last told to do, but for an emergency off
         self._charge: tuple[float, float] | None = None  # time (s) and charge on the film (C) at the last sample
         self._leaking_samples = 0
@@ -164,8 +164,7 @@ class Guard:
         """
         self.check_off()
         assert self.last is not None
-        faults = self.last.flags & TRIP
-        if faults:
+        if faults := self.last.flags & TRIP:
             raise FaultError(f"hv: cannot be armed, the supply reports {flag_names(faults)}. Clear the cause first.")
         limited = self._supply.measures_current
         limit = f"current limit {self._limits.current.high!r} A" if limited else "no current limit"
@@ -181,7 +180,7 @@ class Guard:
         self.state = GuardState.ARMED
         self.cause = ""
         self._alive_at = None
-        self._seen_on = False
+        self._seen_on = self._was_up = False
         self._charge = None
 
     def check_supply(self, highest: float) -> None:
@@ -513,7 +512,7 @@ class Guard:
         """The output must be on, and where the commanded ramp has it; two samples in a row that say no are a fault.
 
         That the supply says of itself that it is ramping excuses nothing. Where no current is measured, a film that
-        breaks down shows in nothing but an output that sags.
+        breaks down shows in nothing but an output that was up and sags; one that never rose is a fault.
         """
         on = HVFlag.ON in sample.flags
         self._seen_on = self._seen_on or on
@@ -527,7 +526,7 @@ class Guard:
             problem, sagged = self._off_its_ramp(sample, before, settled=settled)
         self._deviating_samples = self._deviating_samples + 1 if problem else 0
         if self._deviating_samples >= DEVIATION_SAMPLES:
-            if sagged and not self._supply.measures_current:
+            if sagged and self._was_up and not self._supply.measures_current:
                 raise Breakdown(f"hv: {problem}. This supply measures no current: the film has probably broken down.")
             raise FaultError(f"hv: {problem}.")
 
@@ -543,6 +542,7 @@ class Guard:
         goes_away = heard and before is not None and missing > abs(before.voltage - self.setpoint) + AWAY_V
         inside = least <= sample.voltage <= most and not ((settled or goes_away) and not missing <= allowed)
         if inside:
+            self._was_up = self._was_up or sample.voltage > DEVIATION_V
             return "", False
         ahead = most < sample.voltage < self.setpoint or self.setpoint < sample.voltage < least
         sagged = not ahead and sample.voltage < self.setpoint

@@ -147,36 +147,41 @@ def film_at(specimen: Specimen, h: float, volts: float) -> tuple[float, float, f
 
 
 class Last:
-    """The last sample of the voltage before whatever ends the rise, and the one before that."""
+    """The last sample of the voltage before whatever ends the rise, the one before that, and the one after it."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._newest: HVSample | None = None
         self._before: HVSample | None = None
+        self._after: HVSample | None = None
         self._h = math.nan
 
     def __call__(self, sample: Sample) -> None:
         if isinstance(sample, HVSample):
             # The one on which a breakdown is seen is no longer the film's: the voltage falls by then.
             if self._newest is None or sample.voltage >= self._newest.voltage:
-                self._before, self._newest = self._newest, sample
+                self._before, self._newest, self._after = self._newest, sample, None
+            elif self._after is None:
+                self._after = sample
             self._h = self._rig.recorder.displacement
 
     def write(self, action: Rise, outcome: str, seconds: float) -> str:
         """Write the result to the log; returns it in words.
 
         Without a current a film that broke down is seen only where the output sags: one of high resistance may have
-        broken down far below, and no uncertainty is stated.
+        broken down far below. What is written is an upper bound then, what the voltage may have risen to before the
+        next sample, at most to the ceiling; no uncertainty is stated.
         """
         volts = self._newest.voltage if self._newest is not None else math.nan
-        gap = self._newest.t - self._before.t if self._newest is not None and self._before is not None else math.nan
+        gap = _between(self._before, self._newest)
         apart = action.rise_in(gap) / math.sqrt(12.0)  # it broke anywhere between this sample and the next
         hv = self._rig.scene.hv
         at_most = outcome == BROKE and hv is not None and not hv.measures_current
         if at_most:
-            apart = math.nan
+            rise = action.rise_in(gap if self._after is None else _between(self._newest, self._after))
+            volts, apart = max(volts, min(action.voltage[1], volts + rise)), math.nan
         peak, edge, charge = film_at(self._rig.scene.specimen.specimen(), self._h, volts)
-        share = apart / volts
+        share = apart / volts if volts else math.nan
         for name, value, uncertainty, unit in (
             ("voltage", volts, apart, "V"),
             ("field", peak, peak * share, "V/m"),
@@ -191,3 +196,8 @@ class Last:
         text = f"{words[outcome]} {volts:.0f} V{bound}, {peak * 1e-6:.1f} V/um in the film at {self._h * 1e3:.2f} mm"
         self._rig.event("film", text)
         return text
+
+
+def _between(first: HVSample | None, second: HVSample | None) -> float:
+    """Seconds from the one to the other; NaN where one is missing."""
+    return second.t - first.t if first is not None and second is not None else math.nan

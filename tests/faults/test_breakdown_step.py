@@ -108,7 +108,8 @@ def test_without_a_current_an_output_that_sags_is_a_breakdown_and_its_voltage_an
     found = results(story)
     assert {one["outcome"] for one in found.values()} == {"breakdown"}
     truth = story.bench.world.film.breakdown_voltage(3e-3)
-    assert found["voltage"]["value"] == pytest.approx(truth, rel=0.1)
+    assert truth <= found["voltage"]["value"] <= 1.15 * truth
+    assert found["field_at_disk"]["value"] >= 0.99 * 25e6  # of the model, which has not quite the film's law
     assert all(math.isnan(found[name]["standard_uncertainty"]) for name in ("voltage", "field", "field_at_disk"))
     assert "or below (no current is measured)" in story.outcome.reason
 

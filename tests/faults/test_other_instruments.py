@@ -30,6 +30,7 @@ def inject(role: str, kind: str, **more: Any) -> Callable[[SimulatedBench, Contr
 def test_without_a_current_monitor_a_failing_film_shows_in_the_voltage(tell_other: Tell, kind: str) -> None:
     story = tell_other(inject("hv", kind))
     assert isinstance(story.error, FaultError) and "sagged" in str(story.error), story.error
+    assert story.error.breakdown
     assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S
 
 

@@ -204,8 +204,9 @@ def test_an_output_that_is_not_where_it_was_sent_is_a_fault_at_the_second_sample
     guard.on_sample(sample(1000.0, HVFlag.ON))
     guard.on_sample(sample(998.0, HVFlag.ON | HVFlag.RAMPING))  # on its way
     guard.on_sample(bad)
-    with pytest.raises(FaultError, match=words):
+    with pytest.raises(FaultError, match=words) as told:
         guard.on_sample(bad)
+    assert not told.value.breakdown  # this supply measures the current of a breakdown
 
 
 def test_an_output_that_ramps_away_from_its_set_point_is_a_fault_at_the_second_sample() -> None:
@@ -213,8 +214,39 @@ def test_an_output_that_ramps_away_from_its_set_point_is_a_fault_at_the_second_s
     for voltage in (0.0, 500.0, 1000.0):
         guard.on_sample(sample(voltage, HVFlag.ON | HVFlag.RAMPING))
     guard.on_sample(sample(940.0, HVFlag.ON | HVFlag.RAMPING))
-    with pytest.raises(FaultError, match="sagged to 880 V"):
+    with pytest.raises(FaultError, match="sagged to 880 V") as told:
         guard.on_sample(sample(880.0, HVFlag.ON | HVFlag.RAMPING))
+    assert not told.value.breakdown
+
+
+@pytest.mark.parametrize("measures_current", [True, False])
+@pytest.mark.parametrize("rose", [True, False])
+def test_only_an_output_that_was_up_and_sags_without_a_current_is_a_breakdown(
+    measures_current: bool, rose: bool
+) -> None:
+    guard, supply, _ = live()
+    supply.measures_current = measures_current
+    if rose:
+        guard.on_sample(at(0.0, 999.0))
+    with pytest.raises(FaultError, match="sagged to [234] V") as told:
+        for number in range(1, 8):  # a few volts of noise
+            guard.on_sample(at(0.1 * number, 2.0 + number % 3))
+    assert told.value.breakdown is (rose and not measures_current)
+
+
+def test_an_output_that_was_up_in_an_earlier_arming_only_is_no_breakdown() -> None:
+    guard, supply, _ = live()
+    supply.measures_current = False
+    guard.on_sample(at(0.0, 999.0))
+    guard.ramp_off("end")
+    for t in (10.0, 10.1, 10.2):
+        guard.on_sample(at(t, 0.0, OFF, math.nan, 0.0))
+    guard.arm()
+    guard.request(1000.0, 0.0)
+    with pytest.raises(FaultError, match="sagged to") as told:
+        for number in range(200):
+            guard.on_sample(at(10.3 + 0.1 * number, 2.0 + number % 3, RAMPING, math.nan))
+    assert not told.value.breakdown
 
 
 def test_off_counts_anew_after_every_command() -> None:
@@ -294,9 +326,10 @@ def test_a_monitor_that_does_not_move_with_the_ramp_is_frozen(orderly: bool) -> 
 
 def test_a_ramp_that_moves_however_slowly_is_none_that_is_frozen_but_one_that_lags() -> None:
     guard, _, _ = live()
-    with pytest.raises(FaultError, match="sagged to 5"):
+    with pytest.raises(FaultError, match="sagged to 5") as told:
         for number in range(100):
             guard.on_sample(at(0.1 * number, 500.0 + number // 2, HVFlag.ON | HVFlag.RAMPING))
+    assert not told.value.breakdown
 
 
 # The measured voltage against the commanded ramp -----------------------------------------------------------------
@@ -317,11 +350,12 @@ def settled_guard() -> Guard:
 @pytest.mark.parametrize("rate", [5.0, 20.0, 100.0, -20.0])
 def test_an_output_that_creeps_is_a_fault_whatever_the_supply_says_of_itself(rate: float, flags: HVFlag) -> None:
     guard = settled_guard()
-    with pytest.raises(FaultError, match="risen to 10[5-9]" if rate > 0 else "sagged to 9[2-5]"):
+    with pytest.raises(FaultError, match="risen to 10[5-9]" if rate > 0 else "sagged to 9[2-5]") as told:
         for number in range(3, 500):
             voltage = 1000.0 + rate * 0.1 * (number - 3)
             assert abs(voltage - 1000.0) < 90.0
             guard.on_sample(at(0.1 * number, voltage, flags))
+    assert told.value.breakdown is (rate < 0)  # no current is measured
 
 
 def test_an_output_that_jumps_past_its_ramp_is_a_fault_though_it_is_below_its_set_point() -> None:
@@ -329,19 +363,20 @@ def test_an_output_that_jumps_past_its_ramp_is_a_fault_though_it_is_below_its_se
     guard.request(1400.0, 0.0)
     guard.on_sample(at(0.3, 1030.0, RAMPING, setpoint=1400.0))
     guard.on_sample(at(0.4, 1300.0, RAMPING, setpoint=1400.0))
-    with pytest.raises(FaultError, match="run ahead of its ramp to 1330 V with 1400 V set"):
+    with pytest.raises(FaultError, match="run ahead of its ramp to 1330 V with 1400 V set") as told:
         guard.on_sample(at(0.5, 1330.0, RAMPING, setpoint=1400.0))
+    assert not told.value.breakdown
 
 
 def test_an_output_that_says_ramping_and_stays_is_a_fault_in_about_the_ramps_own_time() -> None:
     guard = settled_guard()
     guard.request(1300.0, 0.0)  # 1 s
     end = 0.0
-    with pytest.raises(FaultError, match="sagged to 10"):
+    with pytest.raises(FaultError, match="sagged to 10") as told:
         for number in range(3, 100):
             end = 0.1 * number
             guard.on_sample(at(end, 1000.0 + number % 7, RAMPING, setpoint=1300.0))
-    assert 1.0 < end < 2.0
+    assert 1.0 < end < 2.0 and told.value.breakdown  # it was up before
 
 
 @pytest.mark.parametrize("start", [1000.0, 400.0])
