@@ -13,6 +13,8 @@ There is no checksum: a digit may change unseen. Commands are read back; a volta
 believed; a set-point or state other than expected is believed when it has been read twice, since the ramp goes on from
 the set-point.
 There is no ramp: the set-point is moved in steps at the polling rate. When the host dies, the voltage stays.
+The power jack is looked at in the set-up, and whenever the output stands clearly below its set-point: without power it
+decays, while the board still says that it is on.
 The current is not measured (NaN) and not limited beyond what the converter can give: `set_current_limit` refuses.
 There is no latch: an emergency off is remembered here, until `clear`.
 Regulation (``VMode``) and source of the switching (``SwSrc``) are changed when it is switched on, and given back as
@@ -30,7 +32,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import suppress
 from typing import ClassVar, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from drivers.dialogue import LOST_AGAIN_S, Answer, Ask, Dialogue, Schedule, Script, label
 from drivers.heard import Heard
@@ -52,6 +54,9 @@ TRIES = 3
 PLAUSIBLE = 1.2
 LONGEST_STEP_S = 0.25
 """A ramp does not make up for time in which nobody polled."""
+
+CLEARLY_BELOW_V = 10.0
+"""The regulated output is this far below a set-point that has stood for a cycle, and not by noise."""
 
 _MAX_LINE = 64
 _LINE = re.compile(rb"[ -~]+\r")
@@ -120,9 +125,17 @@ class ShvpsSettings(SupplySettings, SerialSettings):
         description="How often voltage and state are read (Hz); the ramp is made in steps at this rate. Typical: 10.",
     )
 
+    _looked_at_jack: bool = PrivateAttr(default=True)
+
     def as_recorded(self, sent: Sequence[bytes]) -> None:
         first = next((request for request in sent if b"VMode" in request), b"")
         self._looked_first = first.startswith(b"Q")
+        self._looked_at_jack = sum(b"QJack" in request for request in sent) > 1  # once it is asked in the set-up
+
+    @property
+    def looks_at_jack(self) -> bool:
+        """Recorded dialogues of earlier releases did not ask for it again."""
+        return self._looked_at_jack
 
 
 class Shvps:
@@ -145,6 +158,8 @@ class Shvps:
     looks_first : bool
         Whether it reads the modes that it changes when it is switched on. Recorded dialogues of earlier releases did
         not.
+    looks_at_jack : bool
+        Whether it asks for the power jack where the output stands below its set-point; as above.
     """
 
     measures_current = False
@@ -159,6 +174,7 @@ class Shvps:
         ramp_V_per_s: float = 100.0,
         boot_s: float = 0.0,
         looks_first: bool = False,
+        looks_at_jack: bool = True,
     ) -> None:
         self.name = name
         self.identity = Identity()
@@ -184,6 +200,7 @@ class Shvps:
         self._stepped_at: float | None = None  # None: with the next cycle a ramp begins
         self._on = self._emergency = False
         self._looks_first = looks_first
+        self._looks_at_jack = looks_at_jack
         self.found: dict[str, float] = {}
         self._present: dict[str, float] = {}
         self._dialogue.begin(self._set_up())
@@ -385,6 +402,7 @@ class Shvps:
         if not 0 < max_volts <= 20_000:
             raise DeviceRefused(self._label, f"it states a maximum of {max_volts} V", "Check its configuration.")
         self._jack_missing = bool(needs_jack) and not jack
+        self._looks_at_jack = self._looks_at_jack and bool(needs_jack)
         self.identity = identity(name, version)
         self._max_volts = float(max_volts)
         self._setpoint = self._target = setpoint
@@ -401,12 +419,18 @@ class Shvps:
         self._ready = True
 
     def _cycle(self) -> Script[str, str]:
+        stood = self._setpoint
         if self._on and self._setpoint != self._target:
             yield from self._step()
         answer = yield from self._ask("QVnow")
         self._setpoint = yield from self._confirmed("QVset", self._setpoint)
         mode = yield from self._confirmed("QSwMode", STEADY if self._on else OFF)
         self._on = mode != OFF
+        low = float(answer.message) < min(stood, self._setpoint) - CLEARLY_BELOW_V
+        asks = low and self._on and self._looks_at_jack
+        if asks:
+            with suppress(DeviceSilent):  # then nothing is known of it
+                self._jack_missing = int((yield Ask("QJack", repeat=False)).message) == 0
         flags = HVFlag(0)
         if self._on:
             flags |= HVFlag.ON
@@ -417,6 +441,8 @@ class Shvps:
         if self._jack_missing:
             flags |= HVFlag.FAULT
         self._samples.append(HVSample(answer.t, float(answer.message), math.nan, float(self._setpoint), flags))
+        if asks:
+            yield Ask("QVer")  # as after each number; the sample does not wait for it
 
     def _step(self) -> _Part[None]:
         """Move the set-point towards the target by what the ramp allows since the last step; at least one volt."""

@@ -9,9 +9,12 @@ from typing import Any
 import pytest
 
 from rig.base.errors import FaultError
+from rig.log.reader import read_log
 from rig.operator.control import Control
 from rig.sim.bench import SimulatedBench
+from rig.sim.instruments.shvps import Shvps
 from rig.sim.truth import Fault
+from tests.protocols import TO_THE_FILM
 
 Tell = Callable[..., Any]  # of conftest.Story
 AT_ONCE_S = 1.5
@@ -32,6 +35,46 @@ def test_without_a_current_monitor_a_failing_film_shows_in_the_voltage(tell_othe
     assert isinstance(story.error, FaultError) and "sagged" in str(story.error), story.error
     assert story.error.breakdown
     assert story.outcome.safe and abs(story.final_output) < 60 and story.took < AT_ONCE_S
+
+
+FINDS_A_BREAKDOWN = {
+    "breakdown": 'do = "breakdown"\nceiling_V = 1200\n',
+    "cycle": 'do = "cycle"\nwaveform = "square"\nto_V = 800\nperiod_s = 8.0\ncycles = 3\n',
+}
+
+
+def when_live(act: Callable[[SimulatedBench], None]) -> Callable[[float, SimulatedBench, Control], None]:
+    done: list[float] = []
+
+    def meanwhile(now: float, bench: SimulatedBench, control: Control) -> None:
+        if not done and bench.world.output.at(now)[0] > 500.0:
+            done.append(now)
+            act(bench)
+
+    return meanwhile
+
+
+def test_without_a_current_monitor_a_sag_while_cycling_is_a_breakdown_and_the_result(tell_other: Tell) -> None:
+    sag = when_live(lambda bench: bench.inject(Fault(role="hv", kind="sag")))
+    protocol = f"{TO_THE_FILM}[[step]]\n{FINDS_A_BREAKDOWN['cycle']}"
+    story = tell_other(meanwhile=sag, protocol=protocol)
+    assert story.error is None and story.outcome.status == "complete" and story.outcome.safe, story.outcome
+    found = [message.fields["outcome"] for message in read_log(story.log).messages("/result")]
+    assert found and set(found) == {"breakdown"} and story.final_output < 60
+
+
+@pytest.mark.parametrize("step", FINDS_A_BREAKDOWN)
+def test_a_power_jack_that_falls_out_is_a_fault_and_no_breakdown(tell_other: Tell, step: str) -> None:
+    def pull(bench: SimulatedBench) -> None:
+        supply = bench.instruments["hv"]
+        assert isinstance(supply, Shvps)
+        supply.pull_jack(bench.now)
+
+    story = tell_other(meanwhile=when_live(pull), protocol=f"{TO_THE_FILM}[[step]]\n{FINDS_A_BREAKDOWN[step]}")
+    assert isinstance(story.error, FaultError) and not story.error.breakdown, story.outcome
+    assert "the supply reports fault" in str(story.error)
+    assert story.outcome.status == "fault" and story.outcome.safe and story.final_output < 60
+    assert not list(read_log(story.log).messages("/result"))
 
 
 def watch_targets(bench: SimulatedBench, targets: list[float]) -> None:

@@ -69,6 +69,8 @@ class Shvps:
     ----------
     stuck_on, wrong_mode : faults
         The output neither falls nor is switched off; ``QSwMode`` answers this whatever is true (None: the truth).
+    jack : bool
+        Whether the power jack is plugged in; without it the converter gives nothing.
     """
 
     def __init__(self, settings: ShvpsTruth, world: World, wire: ByteWire, rng: np.random.Generator) -> None:
@@ -79,6 +81,7 @@ class Shvps:
         self._line = bytearray()
         self.stuck_on = self.lies = False
         self.wrong_mode: int | None = None
+        self.jack = settings.power_jack
         self._left = 1.0
         self._frozen: int | None = None
         self._asleep_until = -math.inf
@@ -118,6 +121,11 @@ class Shvps:
         else:
             switch_output(self, self._world, fault, begins, t)
 
+    def pull_jack(self, t: float) -> None:
+        """The power jack falls out: the logic lives on by USB, and the output decays."""
+        self.jack = False
+        self._drive(t)
+
     def set_sag(self, t: float, left: float) -> None:
         """A fault: only this part of the set-point reaches the output from now on."""
         self._left = left
@@ -127,7 +135,7 @@ class Shvps:
 
     def _wanted(self) -> float:
         """Where the output goes (V) if the converter can give the current."""
-        if self._mode != STEADY or self._numbers["SwSrc"] != ONBOARD:
+        if not self.jack or self._mode != STEADY or self._numbers["SwSrc"] != ONBOARD:
             return 0.0
         match self._numbers["VMode"]:
             case 0:
@@ -236,7 +244,7 @@ class Shvps:
             case "Cycle":
                 return f"0/{self._numbers['Cycle']}"
             case "Jack":
-                return str(int(self._settings.power_jack))
+                return str(int(self.jack))
             case "PowJack":
                 return "1"
         return str(self._numbers[name]) if name in NUMBERS else None

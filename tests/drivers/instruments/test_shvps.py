@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import roles
-from drivers.instruments.shvps import Codec, Shvps, encode
+from drivers.instruments.shvps import Codec, Shvps, ShvpsSettings, encode
 from drivers.links.link import DeviceLost, DeviceRefused, DeviceSilent
 from drivers.roles import HVFlag
 
@@ -34,7 +34,7 @@ class FakeSupply:
 
     @property
     def output(self) -> int:
-        return max(0, self.values["Vset"] - 3) if self.values["SwMode"] else 0
+        return max(0, self.values["Vset"] - 3) if self.values["SwMode"] and self.values["Jack"] else 0
 
     def read(self) -> bytes:
         out, self.out = self.out, b""
@@ -246,6 +246,52 @@ def test_missing_power_jack(fake: FakeSupply) -> None:
     bench.supply.switch_on()
     with pytest.raises(DeviceRefused, match="power jack"):
         bench.run(0.1)
+
+
+def test_the_power_jack_is_asked_for_where_the_output_is_low_and_only_there(live: Bench) -> None:
+    live.fake.log.clear()
+    live.supply.set_voltage(2000.0)
+    live.run(1.0)
+    live.supply.set_voltage(500.0)
+    live.run(1.0)
+    assert live.samples[-1].setpoint == 500.0 and "QJack" not in live.fake.log
+    live.samples.clear()
+    live.fake.values["Jack"] = 0
+    live.run(0.2)
+    low = [sample for sample in live.samples if sample.voltage == 0.0]
+    assert low and all(sample.flags == HVFlag.ON | HVFlag.FAULT for sample in low)
+    asked = live.fake.log.index("QJack")  # right after what every sample asks
+    assert live.fake.log[asked - 6 : asked + 2] == [
+        "QVnow",
+        "QVer",
+        "QVset",
+        "QVer",
+        "QSwMode",
+        "QVer",
+        "QJack",
+        "QVer",
+    ]
+
+
+def test_a_low_output_with_its_jack_in_is_no_fault_and_a_missing_answer_no_missing_jack(live: Bench) -> None:
+    answer = live.fake.answer
+    live.fake.answer = lambda command: "400" if command == "QVnow" else answer(command)  # type: ignore[method-assign]
+    live.run(0.3)
+    assert "QJack" in live.fake.log and {sample.flags for sample in live.samples} == {HVFlag.ON}
+    write = live.fake.write
+    live.fake.write = lambda data: None if data == b"QJack\r" else write(data)  # type: ignore[method-assign]
+    live.samples.clear()
+    live.run(1.0)
+    assert len(live.samples) > 3 and {sample.flags for sample in live.samples} == {HVFlag.ON}
+
+
+def test_a_recorded_dialogue_that_never_asked_for_the_jack_again_is_not_asked_for_it() -> None:
+    settings = ShvpsSettings(driver="shvps")
+    assert settings.looks_at_jack
+    settings.as_recorded([b"QVer\r", b"QJack\r", b"QVnow\r"])
+    assert not settings.looks_at_jack
+    settings.as_recorded([b"QVer\r", b"QJack\r", b"QVnow\r", b"QJack\r"])
+    assert settings.looks_at_jack
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,14 @@ def test_set_point_and_monitor_are_off_together(make_host):
     assert output(host) == pytest.approx(1020) and say(host, "QVnow") == "1000\r\n"
 
 
+def test_without_its_power_jack_the_output_decays_and_the_board_still_says_that_it_is_on(make_host):
+    host = make(make_host)
+    say(host, "SVset 1000\rSSwMode 1", 0.5)
+    host.bench.instruments["hv"].pull_jack(host.t)
+    host.wait(0.2)
+    assert output(host) == 0.0 and say(host, "QSwMode\rQJack\rQVset") == "1\r\n0\r\n1000\r\n"
+
+
 def test_found_live(make_host):
     host = make(make_host, start_live_V=500)
     assert say(host, "QVset\rQSwMode\rQVnow") == "500\r\n1\r\n500\r\n"
