@@ -23,6 +23,8 @@ FAILED = "breakdown"
 def log_rows(path: Path, value: str) -> list[dict[str, Any]]:
     """One row for each breakdown test in the log; a film that bore the ceiling, or met a limit, is censored there.
 
+    Of a supply that measures no current the value of a breakdown is an upper bound.
+
     Raises
     ------
     rig.log.errors.LogError
@@ -44,11 +46,13 @@ def log_rows(path: Path, value: str) -> list[dict[str, Any]]:
         raise DataError(f"{path}: holds no scene, so its specimen is not known.")
     scene = parse_table(attached.data.decode("utf-8", "replace"), Scene, "scene", f"{path}, scene.toml")
     specimen = scene.specimen.name or path.stem
+    no_current = scene.hv is not None and not scene.hv.measures_current
     last = max(found)
     return [
         {
             column: one["value"] * factor,
             "censored": one["outcome"] != FAILED,
+            "upper_bound": no_current and one["outcome"] == FAILED,
             "specimen": specimen if step == last else f"{specimen}, step {step}",
             "note": f"{path.name}, step {step}: {one['outcome']}",
         }

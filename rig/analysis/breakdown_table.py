@@ -33,6 +33,7 @@ QUANTITIES = {
     "field_kV_per_mm": ("V/m", 1e6, 1e6, 2e9),
 }
 AREAS = {"area_mm2": 1e-6, "area_cm2": 1e-4}
+ANSWERS = ("censored", "upper_bound")
 YES, NO = ("yes", "true", "1"), ("no", "false", "0")
 WORDS = ("specimen", "group", "note")
 
@@ -46,6 +47,9 @@ class Row(Table):
     field_MV_per_m: float | None = Field(default=None, gt=0, description="The same; 1 MV/m = 1 V/um.")
     field_kV_per_mm: float | None = Field(default=None, gt=0, description="The same; 1 kV/mm = 1 V/um.")
     censored: bool = Field(description="Whether it survived up to this value. yes: no breakdown was seen.")
+    upper_bound: bool | None = Field(
+        default=None, description="yes: it broke down at this value or below; its supply measures no current."
+    )
     area_mm2: float | None = Field(default=None, gt=0, description="Area of the electrode, deformed (mm2).")
     area_cm2: float | None = Field(default=None, gt=0, description="The same in cm2.")
     group: str | None = Field(default=None, min_length=1, description="Batch or kind; groups are compared.")
@@ -61,13 +65,17 @@ class Rows(Table):
 
 @dataclass(frozen=True)
 class Breakdowns:
-    """Values in SI (``unit``: V or V/m), areas over the reference area (m2; None: no areas), groups where named."""
+    """Values in SI (``unit``: V or V/m), areas over the reference area (m2; None: no areas), groups where named.
+
+    ``upper_bound`` tells of which failures the value is only an upper bound; the statistics take it as exact.
+    """
 
     sample: Sample
     unit: str
     reference_area: float | None
     groups: list[str] | None
     names: list[str]
+    upper_bound: list[bool]
 
 
 def read_breakdowns(
@@ -127,6 +135,7 @@ def read_breakdowns(
         reference,
         [str(row.group) for _, row in rows] if grouped else None,
         [row.specimen or where for where, row in rows],
+        [bool(row.upper_bound) and not row.censored for _, row in rows],
     )
 
 
@@ -213,11 +222,11 @@ def _check_columns(names: list[str], path: Path) -> None:
 def _value(name: str, cell: str, separator: str, where: str) -> float | bool | str:
     if name in WORDS:
         return cell
-    if name == "censored":
+    if name in ANSWERS:
         word = cell.casefold()
         if word in YES or word in NO:
             return word in YES
-        raise ConfigError(f'{where}: censored is "{printable(cell)[:40]}"; write yes or no.')
+        raise ConfigError(f'{where}: {name} is "{printable(cell)[:40]}"; write yes or no.')
     number = cell.replace(",", ".") if separator != "," else cell
     try:
         if "_" in number:

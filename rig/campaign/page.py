@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.report.figures import RC, STYLES
 from rig.campaign.campaign import Campaign
-from rig.campaign.report import BOUNDS_WORDS, Row, certificate_problems, statistics_cells
+from rig.campaign.report import Row, bounds_words, certificate_problems, statistics_cells
 from rig.campaign.statistics import DAY_S, Statistics
 
 STYLE = """
@@ -33,7 +33,7 @@ def page(campaign: Campaign, rows: list[Row], found: list[Statistics]) -> str:
     parts = [
         f"<h1>{title}</h1>",
         f"<p>{len(rows)} specimens, {done} done. Standard deviations between and within specimens by random effects. "
-        f"{BOUNDS_WORDS}</p>",
+        f"{html.escape(bounds_words(found))}</p>",
         "<h2>Specimens</h2>",
         _specimens(rows),
         "<h2>Over all specimens</h2>",

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
+from rig.base.errors import ConfigError
 from rig.base.text import printable
+from rig.base.toml_file import parse_table
 from rig.campaign.campaign import Campaign
 from rig.campaign.progress import COMPLETE, Done, progress_of
-from rig.campaign.statistics import BOUNDS, Statistics, Value, plain, statistics_of
-from rig.log.reader import read_log
+from rig.campaign.statistics import BOUNDS, RISING, Statistics, Value, plain, statistics_of
+from rig.log.reader import Log, read_log
+from rig.scene.scene import Scene
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -21,6 +24,11 @@ if TYPE_CHECKING:
 BOUNDS_WORDS = (
     "A result that is a bound only (a film that bore the ceiling) is in none of these numbers: where there are such, "
     "the mean is that of the films that broke, and too low for all. `dea-rig analyse breakdown` takes all of them."
+)
+
+UPPER_WORDS = (
+    'What is marked "at most" comes from films that broke down on supplies that measure no current, there or below. '
+    "These upper bounds are taken as exact: by that the mean is at most too high."
 )
 
 
@@ -73,16 +81,40 @@ def statistics(rows: list[Row], campaign: Campaign) -> list[Statistics]:
         for run in row.done.runs:
             if run.outcome != COMPLETE:
                 continue
-            messages = [message.fields for message in read_log(campaign.logs / run.log).messages("/result")]
+            log = read_log(campaign.logs / run.log)
+            messages = [message.fields for message in log.messages("/result")]
+            no_current = "breakdown" in _kinds(messages) and _measures_no_current(log)
             steps = {kind: sorted({f["step"] for f in messages if f["kind"] == kind}) for kind in _kinds(messages)}
             for f in messages:
                 place = f" (step {f['step']})" if len(steps[f["kind"]]) > 1 else ""
                 name = f"{f['kind']}: {plain(f['name'])}{place}"
                 bound = f["kind"] == "breakdown" and f["outcome"] in BOUNDS
+                broke = f["kind"] == "breakdown" and not bound
+                at_most = no_current and broke and f["name"] in RISING
                 one = row.done.specimen
                 at = datetime.fromisoformat(run.date).timestamp() if run.date else math.nan
-                found.setdefault((name, f["unit"]), []).append(Value(one.name, one.batch, at, f["value"], bound))
+                found.setdefault((name, f["unit"]), []).append(
+                    Value(one.name, one.batch, at, f["value"], bound, at_most)
+                )
     return [statistics_of(name, unit, values) for (name, unit), values in found.items()]
+
+
+def _measures_no_current(log: Log) -> bool:
+    """Whether the scene in it says so; a log without a scene that can be read says nothing."""
+    attached = log.attachments.get("scene.toml")
+    if attached is None:
+        return False
+    try:
+        hv = parse_table(attached.data.decode("utf-8", "replace"), Scene, "scene", f"{log.path}, scene.toml").hv
+    except ConfigError:
+        return False
+    return hv is not None and not hv.measures_current
+
+
+def bounds_words(found: list[Statistics]) -> str:
+    """What is to be said of the bounds among the results; empty without any."""
+    said = (any(one.bounds for one in found), BOUNDS_WORDS), (any(one.upper_bounds for one in found), UPPER_WORDS)
+    return " ".join(words for there, words in said if there)
 
 
 def _kinds(messages: list[dict[str, Any]]) -> set[str]:
@@ -110,7 +142,7 @@ def statistics_table(found: list[Statistics]) -> Table:
     """Statistics for the terminal."""
     from rich.table import Table
 
-    table = Table(title="Over all specimens", caption=BOUNDS_WORDS if any(one.bounds for one in found) else None)
+    table = Table(title="Over all specimens", caption=bounds_words(found) or None)
     for heading in ("result", "n", "mean (95 % interval)", "between", "within", "groups p", "drift per day", "bounds"):
         table.add_column(heading, overflow="fold")
     for cells in statistics_cells(found):
@@ -132,7 +164,8 @@ def statistics_cells(found: list[Statistics]) -> list[list[str]]:
             drift += f" +- {known(one.drift_uncertainty)}, p {known(one.p_drift)}"
         name = f"{one.name} / {one.unit}"
         numbers = [f"{known(one.mean)}{interval}", known(one.between), known(one.within), known(one.p_groups), drift]
-        rows.append([name, str(one.specimens), *numbers, str(one.bounds) if one.bounds else ""])
+        bounds = [str(one.bounds)] * (one.bounds > 0) + [f"{one.upper_bounds} at most"] * (one.upper_bounds > 0)
+        rows.append([name, str(one.specimens), *numbers, ", ".join(bounds)])
     return rows
 
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+RISING = ("voltage", "field", "field_at_disk", "charge")  # results that are upper bounds where the voltage is one
 BOUNDS = ("ceiling", "limit")  # outcomes whose values are bounds: of a film that has not broken down
 LEAST_FOR_DRIFT, LEAST_DAYS = 5, 0.25  # values, and over what time: a slope of minutes says nothing of days
 DAY_S = 86_400.0
@@ -25,13 +26,17 @@ DAY_S = 86_400.0
 
 @dataclass(frozen=True)
 class Value:
-    """One result of one run, SI; ``at_s`` is when the run began (s since 1970), ``bound`` that it is a bound only."""
+    """One result of one run, SI; ``at_s`` is when the run began (s since 1970), ``bound`` that it is a bound only.
+
+    ``at_most``: the film broke down there or below; counted as if it were there.
+    """
 
     specimen: str
     batch: str
     at_s: float
     value: float
     bound: bool = False
+    at_most: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,8 @@ class Statistics:
         Slope over the days, of what is left when each group's mean is taken off.
     bounds : int
         Results that are bounds only, in none of the numbers.
+    upper_bounds : int
+        Results that are upper bounds, of films that broke on supplies that measure no current; in the numbers as exact.
     """
 
     name: str
@@ -80,6 +87,7 @@ class Statistics:
     drift_uncertainty: float
     p_drift: float
     bounds: int
+    upper_bounds: int
 
 
 def statistics_of(name: str, unit: str, values: Sequence[Value]) -> Statistics:
@@ -112,6 +120,7 @@ def statistics_of(name: str, unit: str, values: Sequence[Value]) -> Statistics:
         drift_error,
         p_drift,
         sum(one.bound for one in values),
+        sum(one.at_most for one in known),
     )
 
 

@@ -51,7 +51,8 @@ def breakdown(
 
     \b
     Columns: voltage_kV, voltage_V or field_V_per_um; censored (yes: survived up to this value);
-    if wanted area_mm2, group, specimen, note. Logs need nothing more.
+    if wanted area_mm2, group, specimen, note, upper_bound (yes: its supply measures no current).
+    Logs need nothing more.
     """
     from calibration.breakdown.study import study
     from rig.analysis.breakdown_table import read_breakdowns
@@ -67,7 +68,7 @@ def breakdown(
     show(_fits(table, found))
     for line in _answers(found):
         click.echo(line)
-    for warning in found.warnings:
+    for warning in (*_of_bounds(table), *found.warnings):
         click.echo(f"Warning: {warning}")
     if out is not None:
         write_text(out, _json(table, found, seed))
@@ -188,6 +189,16 @@ def _answers(found: Study) -> list[str]:
     return lines
 
 
+def _of_bounds(table: Breakdowns) -> list[str]:
+    bounds, failed = sum(table.upper_bound), int(table.sample.failed.sum())
+    if not bounds:
+        return []
+    return [
+        f"{bounds} of {failed} failures come from supplies that measure no current. Their values are upper bounds and "
+        "are taken as exact: by that the scale is at most too high, and the shape wrong either way."
+    ]
+
+
 def _json(table: Breakdowns, found: Study, seed: int) -> str:
     import json
     from dataclasses import asdict
@@ -197,9 +208,12 @@ def _json(table: Breakdowns, found: Study, seed: int) -> str:
         "reference_area_m2": table.reference_area,
         "seed": seed,
         "level": 0.95,
+        "upper_bounds_taken_as_exact": sum(table.upper_bound),
         "specimens": [
-            {"specimen": name, "value": float(at), "failed": bool(failed)}
-            for name, at, failed in zip(table.names, table.sample.value, table.sample.failed, strict=True)
+            {"specimen": name, "value": float(at), "failed": bool(failed), "upper_bound": bound}
+            for name, at, failed, bound in zip(
+                table.names, table.sample.value, table.sample.failed, table.upper_bound, strict=True
+            )
         ],
         **asdict(found),
     }

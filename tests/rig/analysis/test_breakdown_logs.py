@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from rig.analysis.breakdown_logs import log_rows
 from rig.cli.app import main
+from rig.log.writer import LogWriter
 from tests.protocols import TO_THE_FILM
 
 SCENES = Path(str(files("sim_fixtures"))) / "scenes"
@@ -63,6 +65,20 @@ def test_films_of_known_strength_come_out_with_it_and_one_is_censored(tmp_path: 
         else:
             assert specimens[name]["failed"]
             assert specimens[name]["value"] == pytest.approx(strength * 1e6, rel=0.06), name
+
+
+@pytest.mark.parametrize(("name", "no_current"), [("cone-4mm", False), ("other-instruments", True)])
+def test_breakdowns_on_a_supply_without_a_current_are_upper_bounds_by_the_scene_in_the_log(
+    tmp_path: Path, name: str, no_current: bool
+) -> None:
+    path = tmp_path / "run.mcap"
+    with LogWriter(path) as log:
+        log.attach("scene.toml", "application/toml", (SCENES / f"{name}.toml").read_bytes())
+        result = {"t_s": 1.0, "kind": "breakdown", "standard_uncertainty": 0.0, "name": "field", "unit": "V/m"}
+        for step, outcome in ((4, "breakdown"), (5, "ceiling")):
+            log.write("/result", result | {"step": step, "outcome": outcome, "value": 40e6}, step, step)
+        log.finish({"status": "complete"})
+    assert [row["upper_bound"] for row in log_rows(path, "field")] == [no_current, False]
 
 
 def test_a_log_without_such_a_step_is_refused_by_name() -> None:

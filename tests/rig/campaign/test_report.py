@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from rig.campaign.campaign import load_campaign
 from rig.campaign.progress import progress_of
-from rig.campaign.report import certificate_problems, rows_of, statistics
+from rig.campaign.report import bounds_words, certificate_problems, rows_of, statistics, statistics_cells
 from rig.cli.app import main
 from rig.log.catalogue import INDEX, runs_in
 from rig.log.writer import LogWriter
@@ -58,6 +58,29 @@ def test_scatter_batches_and_drift_are_of_the_films_that_broke(campaign: Path) -
     assert field.p_groups < 1e-3
     assert field.drift_per_day == pytest.approx(0.5e6)  # in both batches, by least squares
     assert certificate_problems(rows, loaded) == {"a2": ["force: expired"]}
+
+
+@pytest.mark.slow
+def test_films_that_broke_on_a_supply_without_a_current_are_counted_as_upper_bounds(campaign: Path) -> None:
+    loaded = load_campaign(campaign)
+    rows = rows_of(loaded)
+    (before,) = statistics(rows, loaded)
+    assert before.upper_bounds == 0 and "at most" not in bounds_words([before])
+    for name, outcome in (("a1", "breakdown"), ("b4", "ceiling")):
+        path = campaign.parent / "logs" / f"{name}.mcap"
+        path.unlink()
+        with LogWriter(path) as log:
+            log.metadata("run", {"specimen": name})
+            log.attach("scene.toml", "application/toml", SCENE.with_name("other-instruments.toml").read_bytes())
+            result = {"t_s": 1.0, "step": 4, "kind": "breakdown", "standard_uncertainty": math.nan, "value": 30e6}
+            result |= {"outcome": outcome, "name": "field", "unit": "V/m"}
+            log.write("/result", result, START_NS, START_NS)
+            log.write("/result", result | {"name": "displacement", "unit": "m", "value": 3e-3}, START_NS, START_NS)
+            log.finish({"status": "complete"})
+    found = {one.name: one for one in statistics(rows_of(loaded), loaded)}
+    field, displacement = found["breakdown: field"], found["breakdown: displacement"]
+    assert (field.upper_bounds, field.bounds, displacement.upper_bounds) == (1, 1, 0)
+    assert "at most" in bounds_words([field]) and statistics_cells([field])[0][-1] == "1, 1 at most"
 
 
 @pytest.mark.slow

@@ -41,6 +41,18 @@ def test_units_separators_and_formats_give_the_same_numbers(tmp_path: Path) -> N
         assert numbers(tmp_path, name, text) == expected
 
 
+def test_failures_whose_values_are_upper_bounds_are_told_and_counted(tmp_path: Path) -> None:
+    rows = [f"{value},no,{'yes' if k < 3 else 'no'}" for k, value in enumerate(VALUES)]
+    table, out = tmp_path / "a.csv", tmp_path / "a.json"
+    table.write_text("voltage_kV,censored,upper_bound\n" + "\n".join([*rows, "5.0,yes,"]), encoding="utf-8")
+    done = call(table, "-o", out)
+    assert done.exit_code == 0, done.output
+    assert "3 of 10 failures come from supplies that measure no current" in " ".join(done.output.split())
+    found = json.loads(out.read_text(encoding="utf-8"))
+    assert found["upper_bounds_taken_as_exact"] == 3
+    assert [one["upper_bound"] for one in found["specimens"]] == [True] * 3 + [False] * 8
+
+
 def test_plot_and_groups(tmp_path: Path) -> None:
     rows = [f"{value},no,{'new' if k < 5 else 'old'}" for k, value in enumerate(VALUES)]
     table = tmp_path / "a.csv"

@@ -228,7 +228,7 @@ def test_only_an_output_that_was_up_and_sags_without_a_current_is_a_breakdown(
     supply.measures_current = measures_current
     if rose:
         guard.on_sample(at(0.0, 999.0))
-    with pytest.raises(FaultError, match="sagged to [234] V") as told:
+    with pytest.raises(FaultError, match=r"sagged to [234] V") as told:
         for number in range(1, 8):  # a few volts of noise
             guard.on_sample(at(0.1 * number, 2.0 + number % 3))
     assert told.value.breakdown is (rose and not measures_current)
