@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from drivers.roles import HVFlag
+from drivers.roles import HVFlag, HVSample
 from rig.base.errors import LimitError
 from rig.log.reader import read_log
+from rig.scene.scene import load_scene
 from rig.sim.truth import Fault
-from rig.steps.breakdown import Rise
+from rig.steps.breakdown import Last, Rise, film_at
 from tests.protocols import TO_THE_FILM
 
 Tell = Callable[..., Any]  # of conftest.Story
+SCENES = Path(str(files("sim_fixtures"))) / "scenes"
 HEAD = (
     TO_THE_FILM
     + """[[step]]
@@ -112,6 +117,38 @@ def test_without_a_current_an_output_that_sags_is_a_breakdown_and_its_voltage_an
     assert found["field_at_disk"]["value"] >= 0.99 * 25e6  # of the model, which has not quite the film's law
     assert all(math.isnan(found[name]["standard_uncertainty"]) for name in ("voltage", "field", "field_at_disk"))
     assert "or below (no current is measured)" in story.outcome.reason
+
+
+@pytest.mark.parametrize(
+    ("samples", "ceiling", "outcome", "value"),
+    [
+        ([(0.0, 470.0), (0.1, 500.0), (0.25, 10.0), (0.35, 4.0)], 1200.0, "breakdown", 500.0 + 0.15 * 300.0),
+        ([(0.0, 470.0), (0.1, 500.0), (0.25, 10.0)], 520.0, "breakdown", 520.0),  # no higher was asked for
+        ([(0.0, 470.0), (0.1, 500.0)], 1200.0, "limit", 500.0),  # a film that has borne it
+        ([(0.0, 0.0), (0.1, 0.0)], 1200.0, "limit", 0.0),
+    ],
+)
+def test_without_a_current_what_is_written_bounds_what_the_film_bore(
+    samples: list[tuple[float, float]], ceiling: float, outcome: str, value: float
+) -> None:
+    written: dict[str, tuple[float, float]] = {}
+
+    def result(step: int, kind: str, outcome: str, name: str, value: float, uncertainty: float, unit: str) -> None:
+        written[name] = value, uncertainty
+
+    scene, _ = load_scene(SCENES / "other-instruments.toml")
+    recorder = SimpleNamespace(displacement=3e-3, result=result)
+    rig: Any = SimpleNamespace(scene=scene, recorder=recorder, event=lambda *said: None)
+    last = Last(rig)
+    for t, volts in samples:
+        last(HVSample(t, volts, math.nan, 1000.0, HVFlag.ON))
+    plan = {"by": None, "kind": "breakdown", "step": 1, "label": "", "h": (3e-3, 3e-3), "voltage": (0.0, ceiling)}
+    last.write(Rise(**plan, duration=10.0, rate=300.0, most=300.0, hold=0.0), outcome, 5.0)  # type: ignore[arg-type]
+    assert written["voltage"][0] == pytest.approx(value)
+    peak, edge, charge = film_at(scene.specimen.specimen(), 3e-3, value)
+    assert [written[name][0] for name in ("field", "field_at_disk", "charge")] == pytest.approx([peak, edge, charge])
+    known = outcome == "limit" and value > 0.0
+    assert all(math.isfinite(written[name][1]) is known for name in ("field", "field_at_disk", "charge"))
 
 
 def test_a_film_that_bears_the_ceiling_is_censored_there_and_the_run_goes_on(tell: Tell) -> None:
