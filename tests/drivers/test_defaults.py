@@ -12,6 +12,7 @@ from drivers.registry import registered
 
 # What only a scene knows (how long an instrument starts), and what a driver alone is quicker at than in a scene.
 OTHERWISE: dict[tuple[str, str], Any] = {
+    ("shvps", "looks_at_jack"): True,  # but for recorded dialogues
     ("keyence-lkg", "poll_rate_Hz"): 100.0,
     ("keyence-lkg", "timeout_s"): 0.1,
     ("shvps", "poll_rate_Hz"): 20.0,
