@@ -102,6 +102,9 @@ def identify_branches(
     return found.result(base), relaxed
 
 
+UNSETTLED = "the fit of the branches did not come to its end: its figures may be off by more than they state"
+
+
 class _Found:
     """The joint fit at its end, and what follows from it."""
 
@@ -339,7 +342,7 @@ class _Found:
             parameters=list(slopes),
             covariance=matrix.tolist(),
             correlation=(matrix / np.outer(deviation, deviation)).tolist(),
-            warnings=[*spectrum.sentences, *base.warnings],
+            warnings=[*([] if self.point.settled else [UNSETTLED]), *spectrum.sentences, *base.warnings],
             provenance={**base.provenance, "settings": settings},
             measurement=most_useful(quantities, used),
             spectrum=spectrum,

@@ -33,7 +33,7 @@ MOST_RATIO = 20.0
 TOLERANCE = 1e-4  # of the exact solution, of the peak
 NUMERICAL = 3e-5  # of the peak: error of the model and of the means that no sample's noise explains
 LONG = 20  # samples of a bin from which its noise tells correlations
-INNER, OUTER = 12, 6  # steps of Newton's method between exact solutions; exact solutions at most
+INNER, OUTER = 12, 30  # steps of Newton's method between exact solutions; exact solutions at most
 SETTLED, RELATIVE = 0.05, 3e-4  # decrease of chi-square that is none; the same over chi-square
 ENOUGH = 0.3  # decrease of chi-square by a step after which the exact model is not solved again
 LOST = 1e6  # residual where the film has no state
@@ -54,13 +54,15 @@ class Nuisance:
 class Point:
     """A film with the errors of the rig, in the coordinates of a `Joint`, and what the model says there.
 
-    residual : (bins + nuisances,), jacobian : the same by x; slopes : of every record
+    residual : (bins + nuisances,), jacobian : the same by x; slopes : of every record; settled : whether the fit that
+    ends here came to its end
     """
 
     x: Array
     residual: Array
     jacobian: Array
     slopes: list[Slopes]
+    settled: bool = True
 
     @property
     def cost(self) -> float:
@@ -418,9 +420,13 @@ class Joint:
             here = self.minimise(before)
             if self.kept is kept and before.cost - here.cost < max(ENOUGH, RELATIVE * here.cost):
                 break
+        else:
+            here.settled = False
         return here
 
     def fewer(self, here: Point, kept: NDArray[np.bool_]) -> Point:
         """The minimum near one that was found, with the bins that are ``kept`` alone."""
         self.kept = self.within = kept
-        return self.minimise(self.evaluate(here.x))
+        found = self.minimise(self.evaluate(here.x))
+        found.settled = here.settled
+        return found

@@ -230,7 +230,7 @@ def test_a_film_that_softens_and_relaxes_is_told_apart() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_fit_ends_where_the_exact_model_does_after_few_solutions() -> None:
+def test_a_fit_ends_where_the_exact_model_does_after_few_solutions(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cost is that of the exact solutions; one more of them moves the answer by a small part of its uncertainty."""
     cone = ViscousCone(branches=((0.5, 0.8), (0.3, 12.0)), **ONE_TERM)
     given = records(run(cone, paper((0.0, 1500.0), hold=30.0, speed=6e-3), 3, rate=50.0))
@@ -251,6 +251,10 @@ def test_a_fit_ends_where_the_exact_model_does_after_few_solutions() -> None:
     quick = np.argsort(point.x[5:7])  # after a modulus, an exponent, eps_r and two ratios: the times
     order = np.concatenate((np.arange(3), 3 + quick, 5 + quick))
     assert np.abs((point.x[order] - truth[:7]) / deviation[order]).max() < 4.0
+    assert point.settled
+    monkeypatch.setattr("calibration.film.branches.joint.OUTER", 0)
+    ended = joint.fit(point.x)
+    assert not ended.settled and not joint.fewer(ended, joint.kept).settled
 
 
 @pytest.mark.slow
