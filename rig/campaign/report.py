@@ -27,8 +27,8 @@ BOUNDS_WORDS = (
 )
 
 UPPER_WORDS = (
-    'What is marked "at most" comes from films that broke down on supplies that measure no current, there or below. '
-    "These upper bounds are taken as exact: by that the mean is at most too high."
+    'Results marked "at most" are upper bounds: the supply measures no current, the film may have broken down lower. '
+    "They count as exact values here, so the true mean may be lower."
 )
 
 

@@ -195,7 +195,7 @@ def _of_bounds(table: Breakdowns) -> list[str]:
         return []
     return [
         f"{bounds} of {failed} failures come from supplies that measure no current. Their values are upper bounds and "
-        "are taken as exact: by that the scale is at most too high, and the shape wrong either way."
+        "count as exact here: the true scale may be lower, and the shape may be off either way."
     ]
 
 
