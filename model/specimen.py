@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+from model.kernel import film
 from model.material.materials import Material
 
 
@@ -41,6 +43,11 @@ class Specimen:
             )
         if not isinstance(self.material, Material):
             raise TypeError(f"{label}: material must be a Material, not {type(self.material).__name__}")
+
+    @cached_property
+    def record(self) -> bytes:
+        """The film as the compiled kernel reads it."""
+        return film.record((self.disk_radius, self.ring_radius, self.thickness, self.prestretch), self.material)
 
     def with_material(self, material: Material) -> Specimen:
         """The same geometry and pre-stretch with another material."""

@@ -22,9 +22,9 @@ enum {
     YEOH,
     GENT,
     LAWS
-}; /* LAWS of model/membrane/compiled.py, in this order */
+}; /* LAWS of film.py, in this order */
 
-/* Of a film: _Law of model/membrane/compiled.py. */
+/* Of a film: `record` in film.py. */
 typedef struct {
     int64_t kind, moduli, shapes;
     double mu[MOST_PARAMETERS];    /* moduli */

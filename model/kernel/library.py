@@ -12,7 +12,7 @@ import platform
 import sys
 from pathlib import Path
 
-VERSION = 3  # of the functions and what they take; DEA_KERNEL_VERSION in version.h
+VERSION = 4  # of the functions and what they take; DEA_KERNEL_VERSION in version.h
 HERE = Path(__file__).resolve().parent
 REBUILD = "install dea-rig anew (uv sync --reinstall-package dea-rig)"
 

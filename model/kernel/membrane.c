@@ -6,10 +6,9 @@
 #include "from_rest.h"
 #include "several.h"
 
-#ifdef _WIN32
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
+#ifndef SOLVE
+#define SOLVE solve_narrow
+#define WITH_EXPORTS
 #endif
 
 enum {
@@ -19,7 +18,7 @@ enum {
 #define SOFTENING 0.35
 #define FLAT_HEIGHT 1e-9 /* h/b at which the limit of the flat film is solved */
 
-/* A film in SI units: _Film of model/membrane/compiled.py. */
+/* A film in SI units: `record` in film.py. */
 typedef struct {
     double disk_radius, ring_radius, thickness, prestretch, shear_modulus, eps_r, permittivity;
     FilmLaw law;
@@ -295,6 +294,9 @@ static int is_task(const Task *task) {
     return task->tolerance >= 1e-12 && task->tolerance <= 1e-2;
 }
 
+/* Whether four numbers at once may be computed. */
+static int is_wide(const Task *task) { return four_at_once && (task->lanes == 0 || task->lanes > 2); }
+
 /* States side by side, `which` of a call's films they are of, and where their answers go. */
 static void solve_block(const Task *task, const Film *films, int64_t film_count, const int64_t *which, int64_t states,
                         const double *h, const double *voltage, Answer *answers) {
@@ -304,7 +306,7 @@ static void solve_block(const Task *task, const Film *films, int64_t film_count,
         int good = which[s] >= 0 && which[s] < film_count;
         if (good && pose(&films[which[s]], h[s], voltage[s], &ones[count].posed)) place[count++] = s;
     }
-    if (four_at_once && (task->lanes == 0 || task->lanes > 2))
+    if (is_wide(task))
         solve_several_wide(task, ones, count);
     else
         solve_several_narrow(task, ones, count);
@@ -316,8 +318,8 @@ static void solve_block(const Task *task, const Film *films, int64_t film_count,
 
 /* Solve the states (films[which[s]], h[s], voltage[s]), in SI units; `kept` takes their unknowns, or is NULL. Returns
    how many states have no answer here, or -1 where the task itself makes no sense. */
-EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t film_count, const int64_t *which,
-                                int64_t states, const double *h, const double *voltage, Answer *answers, Kept *kept) {
+int64_t SOLVE(const Task *task, const Film *films, int64_t film_count, const int64_t *which, int64_t states,
+              const double *h, const double *voltage, Answer *answers, Kept *kept) {
     int64_t left = 0, alone = kept || states < 2 || task->lanes == 1;
     if (!is_task(task)) return -1;
     for (int64_t s = 0; s < states; s++) answers[s].status = LEFT_TO_OTHERS;
@@ -335,6 +337,40 @@ EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t fil
     return left;
 }
 
+#ifdef WITH_EXPORTS /* membrane_wide.c has no more than what stands above */
+
+#ifdef _WIN32
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+
+int64_t solve_wide(const Task *task, const Film *films, int64_t film_count, const int64_t *which, int64_t states,
+                   const double *h, const double *voltage, Answer *answers, Kept *kept);
+
+/* `SOLVE` as this processor does it. */
+EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t film_count, const int64_t *which,
+                                int64_t states, const double *h, const double *voltage, Answer *answers, Kept *kept) {
+    return (is_wide(task) ? solve_wide : solve_narrow)(task, films, film_count, which, states, h, voltage, answers,
+                                                       kept);
+}
+
+/* One state and what is found of it: `One` in model/membrane/compiled.py. */
+typedef struct {
+    const Task *task;
+    const Film *film;
+    double h, voltage;
+    Answer answer;
+    Kept kept;
+} Single;
+
+/* Solve one state; returns its status. */
+EXPORT int64_t dea_kernel_solve_one(Single *one) {
+    const int64_t first = 0;
+    dea_kernel_solve(one->task, one->film, 1, &first, 1, &one->h, &one->voltage, &one->answer, &one->kept);
+    return one->answer.status;
+}
+
 /* Whether no tension can hold the film: 1 or 0, or -1 where that is left to others. */
 EXPORT int64_t dea_kernel_hangs_slack(const Film *film, double h, double voltage) {
     Posed posed;
@@ -348,3 +384,5 @@ EXPORT void dea_kernel_elementary(int64_t kind, int64_t n, const double *x, doub
     for (int64_t i = 0; i < n; i++)
         out[i] = kind == 0 ? exp_of(x[i]) : kind == 1 ? expm1_of(x[i]) : kind == 2 ? log_of(x[i]) : log1p_of(x[i]);
 }
+
+#endif

@@ -1,18 +1,12 @@
 /* several.c once more, for processors of four numbers at once. The digits are the same: lanes never meet, and no
    operation is contracted. Not with gcc on Windows, which does not align so wide numbers on the stack there. */
-#if defined(__x86_64__) && !(defined(_WIN32) && !defined(__clang__))
 #define LANES 4
 #define SOLVE_SEVERAL solve_several_wide
+#define SOURCE "several.c"
+#include "wide.h"
+
+#ifdef WIDE
 #include <cpuid.h>
-#ifdef __clang__
-#pragma clang attribute push(__attribute__((target("avx2"))), apply_to = function)
-#else
-#pragma GCC target("avx2")
-#endif
-#include "several.c"
-#ifdef __clang__
-#pragma clang attribute pop
-#endif
 
 int four_at_once = 0;
 

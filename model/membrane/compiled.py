@@ -9,10 +9,8 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Sequence
-from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
-from dataclasses import dataclass
+from ctypes import POINTER, Structure, addressof, byref, c_char_p, c_double, c_int64, c_void_p
 from functools import lru_cache
-from itertools import chain
 from struct import Struct
 from typing import Any
 
@@ -20,23 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Array
+from model.kernel.film import MOST_PARAMETERS
 from model.kernel.library import load
-from model.material.gent import Gent
-from model.material.law import Evaluations, Law
-from model.material.materials import EPSILON_0, Material
-from model.material.mooney_rivlin import MooneyRivlin
-from model.material.neo_hooke import NeoHooke
-from model.material.ogden import Ogden
-from model.material.yeoh import Yeoh
+from model.material.law import Evaluations
+from model.material.materials import Material
 from model.membrane import output, ritz
 from model.membrane.flat import REAL, SLOPES, Flat
 from model.membrane.from_rest import CHECK_MODES, TRACE_MODES
 from model.membrane.refinement import SPANS, first_modes, next_modes
+from model.membrane.solution import Status
 from model.specimen import Specimen
 
-MOST_MODES, MOST_ELEMENTS, MOST_PARAMETERS = 64, 5, 8
+MOST_MODES, MOST_ELEMENTS = 64, 5
 MOST_POINTS = MOST_MODES + ritz.MORE_POINTS
-LAWS: tuple[type[Law], ...] = (Ogden, NeoHooke, MooneyRivlin, Yeoh, Gent)  # in the order of their numbers in law.h
 NEEDS_TABLE = -2  # in place of a status, of which the negative ones are left to others
 FEW_LEVELS = 3  # resolutions whose tables are made at once; most states need two
 # Tables for so many modes: the first levels only, those that nearly all states can do with, all. The last are large.
@@ -76,26 +70,6 @@ class _Task(Structure):
         ("sensitivities", c_int64),
         ("lanes", c_int64),
         ("tolerance", c_double),
-    ]
-
-
-class _Law(Structure):
-    """`Law` in law.h."""
-
-    _fields_ = [
-        *((name, c_int64) for name in ("kind", "moduli", "shapes")),
-        ("mu", c_double * MOST_PARAMETERS),
-        ("alpha", c_double * MOST_PARAMETERS),
-    ]
-
-
-class _Film(Structure):
-    """`Film` in membrane.c."""
-
-    _fields_ = [
-        *((name, c_double) for name in ("disk_radius", "ring_radius", "thickness", "prestretch")),
-        *((name, c_double) for name in ("shear_modulus", "eps_r", "permittivity")),
-        ("law", _Law),
     ]
 
 
@@ -139,6 +113,7 @@ class _Kept(Structure):
 
 
 _FRONT = Struct("8d6q")  # an answer up to its derivatives
+_STATUSES = tuple(Status)
 
 
 @lru_cache(maxsize=MOST_MODES)
@@ -182,67 +157,33 @@ def _task(tolerance: float, relaxed: bool, sensitivities: bool, most: int) -> _T
     return task
 
 
-def _films(specimens: Sequence[Specimen]) -> NDArray[np.void]:
-    """Films as the kernel reads them; one that it does not know has a law without a number."""
-    films = np.zeros(len(specimens), dtype=_FILM)
-    numbers = films.view(np.float64).reshape(len(films), _FILM.itemsize // 8)
-    materials = [specimen.material for specimen in specimens]
-    numbers[:, :4] = _rows([(s.disk_radius, s.ring_radius, s.thickness, s.prestretch) for s in specimens])
-    numbers[:, 4] = [m.shear_modulus for m in materials]
-    numbers[:, 5] = [m.eps_r for m in materials]
-    numbers[:, 6] = EPSILON_0 * numbers[:, 5]
-    laws, kinds = films["law"], [(m.law, len(m.mu), len(m.alpha)) for m in materials]
-    for one in set(kinds):
-        law, moduli, shapes = one
-        these = slice(None) if kinds.count(one) == len(kinds) else [i for i, kind in enumerate(kinds) if kind == one]
-        known = law in LAWS and max(moduli, shapes) <= MOST_PARAMETERS
-        laws["kind"][these] = LAWS.index(law) if known else -1
-        if known:
-            some = materials if isinstance(these, slice) else [materials[i] for i in these]
-            laws["moduli"][these], laws["shapes"][these] = moduli, shapes
-            laws["mu"][these, :moduli] = _rows([m.mu for m in some])
-            laws["alpha"][these, :shapes] = _rows([m.alpha for m in some])
-    return films
-
-
-def _rows(rows: Sequence[tuple[float, ...]]) -> Array:
-    """Rows of as many numbers each: three times as fast as NumPy's own way from a list of tuples."""
-    width = len(rows[0])
-    return np.fromiter(chain.from_iterable(rows), dtype=np.float64, count=len(rows) * width).reshape(len(rows), width)
-
-
-def _film(specimen: Specimen) -> _Film:
-    """One film, without the detour over arrays."""
-    m = specimen.material
-    if m.law not in LAWS or max(len(m.mu), len(m.alpha)) > MOST_PARAMETERS:
-        return _Film(law=_Law(-1))
-    law = _Law(LAWS.index(m.law), len(m.mu), len(m.alpha), m.mu, m.alpha)
-    radii = specimen.disk_radius, specimen.ring_radius
-    return _Film(*radii, specimen.thickness, specimen.prestretch, m.shear_modulus, m.eps_r, m.permittivity, law)
-
-
 # Of the kernel's function: task, films and how many, film of every state, states, h, voltage; answers, unknowns.
 ARGUMENTS: list[Any] = [c_void_p, c_void_p, c_int64, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p]
 
 
 @lru_cache(maxsize=1)
-def _solver() -> Any:
-    """The kernel's function; None where there is no kernel."""
-    library = load()
-    if library is None:
-        return None
-    function = library.dea_kernel_solve
-    function.restype = c_int64
-    function.argtypes = ARGUMENTS
-    return function
+def _kernel() -> Any:
+    """The kernel with its functions; None where there is none."""
+    kernel = load()
+    if kernel is not None:
+        kernel.dea_kernel_solve.restype = kernel.dea_kernel_solve_one.restype = c_int64
+        kernel.dea_kernel_solve.argtypes = ARGUMENTS
+        kernel.dea_kernel_hangs_slack.restype = c_int64
+        kernel.dea_kernel_hangs_slack.argtypes = [c_void_p, c_double, c_double]
+    return kernel
 
 
-@dataclass(slots=True)
-class One:
-    """One solved state."""
+class One(Structure):
+    """One state and what the kernel finds of it: `Single` in membrane.c."""
 
-    answer: Any  # _Answer
-    kept: Any  # _Kept
+    _fields_ = [
+        ("task", c_void_p),  # of the call alone
+        ("film", c_char_p),
+        ("h", c_double),
+        ("voltage", c_double),
+        ("answer", _Answer),
+        ("kept", _Kept),
+    ]
 
     @property
     def lam(self) -> float:
@@ -266,86 +207,82 @@ class One:
         relaxed = np.broadcast_to(np.array(kept.folded[:m], dtype=np.bool_)[:, None], w.shape)
         return grid, ritz.State(c, w, natural, relaxed)
 
-    def attributes(self, material: Material, sensitivities: bool) -> dict[str, Any]:
+    def attributes(self, specimen: Specimen, h: float, voltage: float, sensitivities: bool) -> dict[str, Any]:
         """Attributes of `model.membrane.solve.Solution`."""
-        # All at once, and none by its name: that way it takes a tenth of what the kernel does.
-        front = _FRONT.unpack_from(self.answer)
+        # All at once, and none by its name: that way it takes a fifth of what the kernel does.
+        front = _FRONT.unpack_from(self, _ANSWER)
         force, field, radius, hoop, meridional, stretch, error, _, status, iterations, modes, *points = front
-        values: dict[str, Any] = {
+        material = specimen.material
+        return {
+            "specimen": specimen,
+            "h": h,
+            "voltage": voltage,
             "force": force,
             "peak_field": field,
             "peak_field_radius": radius,
             "min_hoop_stress": hoop,
             "min_meridional_stress": meridional,
             "max_stretch": stretch,
+            "status": _STATUSES[status],
             "error_estimate": error,
             "iterations": iterations,
             "modes": modes,
             "stable": status <= 1,
             "field_exceeded": field > (material.breakdown_field or math.inf),
             "stretch_exceeded": stretch > (material.max_stretch or math.inf),
+            "dforce": self.dforce(material) if sensitivities else None,
             "evaluations": Evaluations(*points),
+            "kept": None,
+            "quick": self,
         }
-        values["dforce"] = self.dforce(material) if sensitivities else None
-        return values
 
     def dforce(self, material: Material) -> dict[str, Any]:
         """The derivatives of the force, as `model.membrane.solution.Solutions` has them."""
-        slopes = self.answer.dforce
-        found: dict[str, Any] = {name: getattr(slopes, name) for name in SLOPES}
-        return found | {
-            "mu": np.array(slopes.mu[: len(material.mu)]),
-            "alpha": np.array(slopes.alpha[: len(material.alpha)]),
-        }
+        words = memoryview(self).cast("B")[_ANSWER + _FRONT.size :]
+        slopes = np.frombuffer(words, np.float64, len(SLOPES) + 2 * MOST_PARAMETERS)
+        found: dict[str, Any] = dict(zip(SLOPES, slopes.tolist(), strict=False))
+        for name, given in (("mu", len(material.mu)), ("alpha", len(material.alpha))):
+            first = _SLOPES[name] - _SLOPES["h"]
+            found[name] = slopes[first : first + given]
+        return found
+
+
+_ANSWER = One.answer.offset
 
 
 def solve_one(
     specimen: Specimen, h: float, voltage: float, *, tolerance: float, relaxed: bool, sensitivities: bool
 ) -> One | None:
     """One state, or None where it is left to others."""
-    solver = _solver()
-    if solver is None:
+    kernel = _kernel()
+    if kernel is None:
         return None
-    film, answer, kept = _one_film(specimen), _Answer(), _Kept()
     for most in TIERS:
         task = _task(tolerance, relaxed, sensitivities, most)
-        where = byref(c_double(h)), byref(c_double(voltage))
-        solver(byref(task), byref(film), 1, byref(_FIRST), 1, *where, byref(answer), byref(kept))
-        if answer.status != NEEDS_TABLE:
+        one = One(addressof(task), specimen.record, h, voltage)
+        status = kernel.dea_kernel_solve_one(byref(one))
+        if status != NEEDS_TABLE:
             break
-    return One(answer, kept) if answer.status >= 0 else None
+    return one if status >= 0 else None
 
 
 def hangs_slack(specimen: Specimen, h: float, voltage: float) -> bool | None:
     """Whether no tension can hold the film; None where that is left to others."""
-    solver = _solver()
-    if solver is None:
+    kernel = _kernel()
+    if kernel is None:
         return None
-    found = _slack()(byref(_one_film(specimen)), h, voltage)
+    found = kernel.dea_kernel_hangs_slack(specimen.record, h, voltage)
     return None if found < 0 else bool(found)
 
 
 def warm() -> None:
     """Make what any state needs at `solve`'s own tolerance: it takes some 0.2 s, which a loop has no time for."""
-    if _solver() is not None:
+    if _kernel() is not None:
         for most in TIERS:
             _task(1e-8, False, False, most)
 
 
-@lru_cache(maxsize=1)
-def _slack() -> Any:
-    library = load()
-    assert library is not None
-    function = library.dea_kernel_hangs_slack
-    function.restype = c_int64
-    function.argtypes = [c_void_p, c_double, c_double]
-    return function
-
-
-_one_film = lru_cache(maxsize=16)(_film)
-_FIRST = c_int64(0)  # the only film of a call for one state
 _RECORD: np.dtype[Any] = np.dtype(_Answer)
-_FILM: np.dtype[Any] = np.dtype(_Film)
 _WORDS = {name: _RECORD.fields[name][1] // 8 for name in _RECORD.names or ()} if _RECORD.fields else {}
 _SLOPES = {name: _WORDS["dforce"] + getattr(_Slopes, name).offset // 8 for name in (*SLOPES, "mu", "alpha")}
 
@@ -362,19 +299,18 @@ def solve_states(
     relaxed: bool,
 ) -> NDArray[np.bool_]:
     """Write the states (S,) of ``specimens[which]`` into ``result``; tells which are left to others."""
-    solver = _solver()
+    kernel = _kernel()
     left = np.ones(len(h), dtype=np.bool_)
-    if solver is None or not specimens:
+    if kernel is None or not specimens:
         return left
-    films = _films(specimens) if len(specimens) > 1 else _one_film(specimens[0])
-    where = byref(films) if isinstance(films, _Film) else films.ctypes.data
+    films = b"".join([specimen.record for specimen in specimens])
     for most in TIERS:
         some = np.flatnonzero(left)
         of, hh, vv = which[some].astype(np.int64), h[some].astype(np.float64), voltage[some].astype(np.float64)
         found = np.zeros(len(some), dtype=_RECORD)
         task = _task(tolerance, relaxed, result.dforce is not None, most)
         data = [array.ctypes.data for array in (of, hh, vv, found)]
-        solver(byref(task), where, len(specimens), data[0], len(some), *data[1:], None)
+        kernel.dea_kernel_solve(byref(task), films, len(specimens), data[0], len(some), *data[1:], None)
         status = found["status"]
         good = status >= 0
         if good.all() and most == 0:

@@ -242,18 +242,6 @@ def _check(tolerance: float, wrinkling: str) -> None:
         raise ValueError(f'wrinkling = {wrinkling!r}: allowed are "plain" and "tension_field"')
 
 
-_STATUSES = tuple(Status)
-
-
-def _compiled(specimen: Specimen, h: float, voltage: float, one: compiled.One, sensitivities: bool) -> Solution:
-    """What the kernel has found."""
-    solution = object.__new__(Solution)  # its own way in, attribute after attribute, takes half as long as the kernel
-    status = _STATUSES[one.answer.status]
-    solution.__dict__.update(one.attributes(specimen.material, sensitivities), quick=one, kept=None)
-    solution.__dict__.update(specimen=specimen, h=h, voltage=voltage, status=status)
-    return solution
-
-
 def _solve(
     inputs: _Inputs, tolerance: float, wrinkling: Wrinkling, sensitivities: bool, keep: bool = False
 ) -> tuple[Solutions, list[tuple[NDArray[np.intp], Solved]]]:
@@ -290,18 +278,18 @@ def solve(
 ) -> Solution:
     """Solve one state: `solve_many` for scalars, with the profiles at hand."""
     _check(tolerance, wrinkling)
-    folds = wrinkling == "tension_field"
-    one = compiled.solve_one(
-        specimen, float(h), float(voltage), tolerance=tolerance, relaxed=folds, sensitivities=sensitivities
-    )
+    h, voltage, relaxed = float(h), float(voltage), wrinkling == "tension_field"
+    one = compiled.solve_one(specimen, h, voltage, tolerance=tolerance, relaxed=relaxed, sensitivities=sensitivities)
     if one is not None:
-        return _compiled(specimen, float(h), float(voltage), one, sensitivities)
-    inputs = _Inputs.gather(specimen, float(h), float(voltage))
+        solution = object.__new__(Solution)  # attribute after attribute takes half as long as the kernel
+        object.__setattr__(solution, "__dict__", one.attributes(specimen, h, voltage, sensitivities))
+        return solution
+    inputs = _Inputs.gather(specimen, h, voltage)
     many, kept = _solve(inputs, tolerance, wrinkling, sensitivities, keep=True)
     return Solution(
         specimen=specimen,
-        h=float(h),
-        voltage=float(voltage),
+        h=h,
+        voltage=voltage,
         force=float(many.force),
         peak_field=float(many.peak_field),
         peak_field_radius=float(many.peak_field_radius),

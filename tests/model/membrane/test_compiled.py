@@ -34,7 +34,7 @@ SOFT = Specimen(4e-3, 20e-3, 100e-6, 3.0, Material("soft", (1e5,), (1.3,), 3.0))
 @contextmanager
 def no_kernel() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled, "_solver", lambda: None)
+        patch.setattr(compiled, "_kernel", lambda: None)
         yield
 
 
@@ -238,7 +238,7 @@ def test_states_side_by_side_have_the_bits_that_they_have_alone(wrinkling: str, 
     h = np.concatenate([h, np.linspace(1e-3, 14e-3, 40), np.linspace(10e-3, 14e-3, 10)])
     voltage = np.concatenate([voltage, np.linspace(0.0, 1500.0, 40), np.full(10, 1400.0)])
     which = np.arange(len(films), dtype=np.int64)
-    records = compiled._films(films)
+    records = b"".join(film.record for film in films)
     found = []
     for lanes in (1, 2, 0):
         task = compiled._task(tolerance, wrinkling == "tension_field", True, compiled.MOST_MODES)
@@ -246,8 +246,8 @@ def test_states_side_by_side_have_the_bits_that_they_have_alone(wrinkling: str, 
         task.lanes = lanes
         answers = np.zeros(len(films), dtype=np.dtype(compiled._Answer))
         data = [array.ctypes.data for array in (h, voltage, answers)]
-        solver = compiled._solver()
-        solver(ctypes.byref(task), records.ctypes.data, len(films), which.ctypes.data, len(films), *data, None)
+        solver = compiled._kernel().dea_kernel_solve
+        solver(ctypes.byref(task), records, len(films), which.ctypes.data, len(films), *data, None)
         found.append(answers)
     for answers in found:  # points are counted once more where a state goes on alone after all
         answers["mechanical"] = answers["electric"] = 0
@@ -284,15 +284,6 @@ def test_flat_slack_and_impossible_states_have_the_status_of_the_path_for_arrays
         np.testing.assert_allclose(mine.force, theirs.force, rtol=1e-9)
 
 
-def test_a_film_alone_is_read_as_among_others() -> None:
-    films, _, _ = random_films(20, seed=4)
-    films += [
-        replace(FILM, material=Material(name, mu, alpha, 2.5, law=law)) for name, (law, mu, alpha) in LAWS.items()
-    ]
-    for film, record in zip(films, compiled._films(films), strict=True):
-        assert bytes(compiled._film(film)) == record.tobytes()
-
-
 def test_films_that_the_kernel_does_not_know_are_left_to_others() -> None:
     many = Material("many", (1e4,) * 9, tuple(np.linspace(2.0, 4.0, 9)), 3.0)
     state = {"tolerance": 1e-8, "relaxed": False, "sensitivities": False}
@@ -305,20 +296,19 @@ def test_films_that_the_kernel_does_not_know_are_left_to_others() -> None:
 def test_hostile_numbers_get_a_status_and_crash_nothing() -> None:
     """Any bits as a film, a state, a number of terms, an index; a task that makes no sense is refused."""
     random = np.random.default_rng(3)
-    solver = compiled._solver()
+    solver = compiled._kernel().dea_kernel_solve
     task = compiled._task(1e-8, True, True, compiled.MOST_MODES)
-    film, answers, state = compiled._film(FILM), (compiled._Answer * 1)(), compiled._Kept()
+    answers, state = (compiled._Answer * 1)(), compiled._Kept()
     taut = 0
     for _ in range(3000):
-        bad = compiled._Film.from_buffer_copy(film)
-        words = np.frombuffer(bad, dtype=np.int64)
+        words = np.frombuffer(FILM.record, dtype=np.int64).copy()
         for place in random.integers(0, len(words), random.integers(0, 3)):
             words[place] = random.choice([0, -1, 3, 2**62, random.integers(-(2**62), 2**62)])
         h, v = 10.0 ** random.uniform(-320, 300), 10.0 ** random.uniform(-5, 10)
         which = ctypes.c_int64(int(random.choice([0, 0, 0, -1, 1, 2**62])))
         where = [ctypes.c_double(random.choice(pair)) for pair in ([h, 1e-2, np.nan], [v, 800.0, -np.inf])]
         given = [ctypes.byref(x) for x in (*where, answers, state)]
-        assert solver(ctypes.byref(task), ctypes.byref(bad), 1, ctypes.byref(which), 1, *given) in (0, 1)
+        assert solver(ctypes.byref(task), words.ctypes.data, 1, ctypes.byref(which), 1, *given) in (0, 1)
         if answers[0].status >= 0:
             taut += 1
             assert answers[0].status in (0, 1, 2, 3, 4)
@@ -328,4 +318,4 @@ def test_hostile_numbers_get_a_status_and_crash_nothing() -> None:
     for name, value in (("tolerance", np.nan), ("tolerance", 0.0), ("first_modes", (2**40, 4, 4))):
         wrong = compiled._Task.from_buffer_copy(task)
         setattr(wrong, name, value)
-        assert solver(ctypes.byref(wrong), ctypes.byref(film), 1, ctypes.byref(which), 1, *given) == -1
+        assert solver(ctypes.byref(wrong), FILM.record, 1, ctypes.byref(which), 1, *given) == -1

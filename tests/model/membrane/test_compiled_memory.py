@@ -39,7 +39,7 @@ def random_films(count: int, random: np.random.Generator) -> Array:
         Specimen(4e-3, 20e-3, 40e-6, 1.2, Material(name, *NUMBERS[name], 2.0, law=known_laws()[name]))
         for name in NUMBERS
     ]
-    good = np.array([np.frombuffer(compiled._film(specimen), dtype=np.float64) for specimen in specimens])
+    good = np.array([np.frombuffer(specimen.record, dtype=np.float64) for specimen in specimens])
     films = good[random.integers(0, len(good), count)]
     films[:, :4] *= 10.0 ** random.uniform(-0.5, 0.4, (count, 4))
     words = films.view(np.int64)

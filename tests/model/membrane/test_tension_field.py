@@ -65,7 +65,7 @@ def test_the_kernel_finds_what_the_path_for_arrays_does(
     lp: float, h: float, v: float, cuts: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = solve(film(lp), h, v, tolerance=1e-9, wrinkling="tension_field")
-    monkeypatch.setattr(compiled, "_solver", lambda: None)
+    monkeypatch.setattr(compiled, "_kernel", lambda: None)
     many = solve_many(film(lp), [h], v, tolerance=1e-9, wrinkling="tension_field")
     assert one.status == many.status[0] == Status.WRINKLED
     assert one.force == pytest.approx(many.force[0], rel=2e-9)
