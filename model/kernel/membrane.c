@@ -331,8 +331,8 @@ int64_t SOLVE(const Task *task, const Film *films, int64_t film_count, const int
         solve_block(task, films, film_count, which + s, states - s < BLOCK ? states - s : BLOCK, h + s, voltage + s,
                     answers + s);
     for (int64_t s = 0; s < states; s++) {
-        if (answers[s].status > WRINKLED) leave_blank(&answers[s]);
-        if (answers[s].status < 0) left++;
+        if (answers[s].status < 0) answers[s].iterations = 0, left++;
+        if (answers[s].status < 0 || answers[s].status > WRINKLED) leave_blank(&answers[s]);
     }
     return left;
 }

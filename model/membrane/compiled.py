@@ -23,7 +23,7 @@ from model.kernel.library import load
 from model.material.law import Evaluations
 from model.material.materials import Material
 from model.membrane import output, ritz
-from model.membrane.flat import REAL, SLOPES, Flat
+from model.membrane.flat import REAL, SLOPES, WHOLE, Flat
 from model.membrane.from_rest import CHECK_MODES, TRACE_MODES
 from model.membrane.refinement import SPANS, first_modes, next_modes
 from model.membrane.solution import Status
@@ -238,8 +238,8 @@ class One(Structure):
 
     def dforce(self, material: Material) -> dict[str, Any]:
         """The derivatives of the force, as `model.membrane.solution.Solutions` has them."""
-        words = memoryview(self).cast("B")[_ANSWER + _FRONT.size :]
-        slopes = np.frombuffer(words, np.float64, len(SLOPES) + 2 * MOST_PARAMETERS)
+        memory: Any = self
+        slopes = np.frombuffer(memory, np.float64, len(SLOPES) + 2 * MOST_PARAMETERS, _ANSWER + _FRONT.size)
         found: dict[str, Any] = dict(zip(SLOPES, slopes.tolist(), strict=False))
         for name, given in (("mu", len(material.mu)), ("alpha", len(material.alpha))):
             first = _SLOPES[name] - _SLOPES["h"]
@@ -282,14 +282,13 @@ def warm() -> None:
             _task(1e-8, False, False, most)
 
 
+_NONE = np.empty(0, dtype=np.intp)
 _RECORD: np.dtype[Any] = np.dtype(_Answer)
 _WORDS = {name: _RECORD.fields[name][1] // 8 for name in _RECORD.names or ()} if _RECORD.fields else {}
 _SLOPES = {name: _WORDS["dforce"] + getattr(_Slopes, name).offset // 8 for name in (*SLOPES, "mu", "alpha")}
 
 
 def solve_states(
-    result: Flat,
-    count: Evaluations,
     specimens: Sequence[Specimen],
     which: NDArray[np.intp],
     h: Array,
@@ -297,74 +296,55 @@ def solve_states(
     *,
     tolerance: float,
     relaxed: bool,
-) -> NDArray[np.bool_]:
-    """Write the states (S,) of ``specimens[which]`` into ``result``; tells which are left to others."""
+    sensitivities: bool,
+) -> tuple[Flat, Evaluations, NDArray[np.bool_]] | None:
+    """The states (S,) of ``specimens[which]``, what they cost, and which are left to others; None without a kernel."""
     kernel = _kernel()
-    left = np.ones(len(h), dtype=np.bool_)
     if kernel is None or not specimens:
-        return left
-    films = b"".join([specimen.record for specimen in specimens])
+        return None
+    films, found = b"".join([specimen.record for specimen in specimens]), np.zeros(len(h), dtype=_RECORD)
+    some: slice | NDArray[np.intp] = slice(None)
     for most in TIERS:
-        some = np.flatnonzero(left)
-        of, hh, vv = which[some].astype(np.int64), h[some].astype(np.float64), voltage[some].astype(np.float64)
-        found = np.zeros(len(some), dtype=_RECORD)
-        task = _task(tolerance, relaxed, result.dforce is not None, most)
-        data = [array.ctypes.data for array in (of, hh, vv, found)]
-        kernel.dea_kernel_solve(byref(task), films, len(specimens), data[0], len(some), *data[1:], None)
-        status = found["status"]
-        good = status >= 0
-        if good.all() and most == 0:
-            _place(result, count, specimens, which, None, found)
-        else:
-            _place(result, count, specimens, which, some[good], found[good])
-        left[some[good]] = False
-        if not (status == NEEDS_TABLE).any():
+        task, part = _task(tolerance, relaxed, sensitivities, most), found[some]
+        given = np.ascontiguousarray(which[some], dtype=np.int64), h[some], voltage[some], part
+        of, *data = [array.ctypes.data for array in given]
+        left = kernel.dea_kernel_solve(byref(task), films, len(specimens), of, len(part), *data, None)
+        if most:
+            found[some] = part
+        some = np.flatnonzero(found["status"] == NEEDS_TABLE) if left else _NONE
+        if len(some) == 0:
             break
-    return left
+    return _placed(specimens, which, found, sensitivities)
 
 
-def _place(
-    result: Flat,
-    count: Evaluations,
-    specimens: Sequence[Specimen],
-    which: NDArray[np.intp],
-    to: NDArray[np.intp] | None,
-    found: NDArray[np.void],
-) -> None:
-    """Write what is ``found`` of the states ``to``, or of all of them, where copying can be spared."""
+def _placed(
+    specimens: Sequence[Specimen], which: NDArray[np.intp], found: NDArray[np.void], sensitivities: bool
+) -> tuple[Flat, Evaluations, NDArray[np.bool_]]:
+    """What is ``found`` in columns; where there is no answer yet the status is INVALID."""
     words = np.ascontiguousarray(found.view(np.float64).reshape(len(found), _RECORD.itemsize // 8).T)
-
-    def put(into: dict[str, Any], name: str, values: NDArray[Any]) -> None:
-        if to is None:
-            into[name] = values
-        else:
-            into[name][to] = values
-
-    for name in result.real:
-        put(result.real, name, words[_WORDS[name]])
-    for name in result.whole:
-        put(result.whole, name, words[_WORDS[name]].view(np.int64).astype(np.intp, copy=False))
-    points = words[_WORDS["mechanical"] : _WORDS["relaxed"] + 1].view(np.int64).sum(axis=1)
-    for name, number in zip(("mechanical", "electric", "relaxed"), points.tolist(), strict=True):
-        setattr(count, name, getattr(count, name) + number)
-    every = slice(None) if to is None else to
-    status = words[_WORDS["status"]].view(np.int64)
-    result.status[every] = status
-    put(result.flag, "stable", status <= 1)
-    of = which[every]
+    whole = words.view(np.int64)
+    status = whole[_WORDS["status"]].astype(np.int8)
+    left = status < 0
+    status[left] = Status.INVALID
     materials = [specimen.material for specimen in specimens]
-    for name, quantity, limits in (
-        ("field_exceeded", "peak_field", [m.breakdown_field or math.inf for m in materials]),
-        ("stretch_exceeded", "max_stretch", [m.max_stretch or math.inf for m in materials]),
-    ):
-        put(result.flag, name, words[_WORDS[quantity]] > np.array(limits)[of])
-    if result.dforce is None:
-        return
-    for name in SLOPES:
-        put(result.dforce, name, words[_SLOPES[name]])
-    for name, given in (("mu", [len(m.mu) for m in materials]), ("alpha", [len(m.alpha) for m in materials])):
-        width = result.dforce[name].shape[1]
-        slopes = words[_SLOPES[name] : _SLOPES[name] + width].T
-        if min(given) < width:
-            slopes = np.where(np.arange(width) >= np.array(given, dtype=np.intp)[of][:, None], np.nan, slopes)
-        put(result.dforce, name, slopes)
+    strength = np.array([m.breakdown_field or math.inf for m in materials])[which]
+    elongation = np.array([m.max_stretch or math.inf for m in materials])[which]
+    result = Flat(
+        real={name: words[_WORDS[name]] for name in REAL},
+        whole={name: whole[_WORDS[name]].astype(np.intp, copy=False) for name in WHOLE},
+        flag={
+            "stable": status <= 1,
+            "field_exceeded": words[_WORDS["peak_field"]] > strength,
+            "stretch_exceeded": words[_WORDS["max_stretch"]] > elongation,
+        },
+        status=status,
+    )
+    if sensitivities:
+        result.dforce = {name: words[_SLOPES[name]] for name in SLOPES}
+        for name, given in (("mu", [len(m.mu) for m in materials]), ("alpha", [len(m.alpha) for m in materials])):
+            slopes = words[_SLOPES[name] : _SLOPES[name] + max(given)].T
+            if min(given) < max(given):
+                slopes[np.arange(max(given)) >= np.array(given)[which][:, None]] = np.nan
+            result.dforce[name] = slopes
+    points = whole[_WORDS["mechanical"] : _WORDS["relaxed"] + 1].sum(axis=1)
+    return result, Evaluations(*points.tolist()), left

@@ -247,19 +247,17 @@ def _solve(
 ) -> tuple[Solutions, list[tuple[NDArray[np.intp], Solved]]]:
     """The solutions, and with ``keep`` the states themselves."""
     _check(tolerance, wrinkling)
-    result = Flat(
-        len(inputs.h),
-        max((len(s.material.mu) for s in inputs.specimens), default=1),
-        max((len(s.material.alpha) for s in inputs.specimens), default=1),
-        sensitivities,
-        keep,
-    )
-    count = Evaluations()
-    wanted = np.ones(len(inputs.h), dtype=np.bool_)
+    solved = None
     if not keep:
-        inputs_of = inputs.specimens, inputs.which, inputs.h, inputs.voltage
+        states = inputs.specimens, inputs.which, inputs.h, inputs.voltage
         relaxed = wrinkling == "tension_field"
-        wanted = compiled.solve_states(result, count, *inputs_of, tolerance=tolerance, relaxed=relaxed)
+        solved = compiled.solve_states(*states, tolerance=tolerance, relaxed=relaxed, sensitivities=sensitivities)
+    if solved is None:
+        materials = [specimen.material for specimen in inputs.specimens]
+        result, count = Flat.blank(len(inputs.h), materials, sensitivities, keep), Evaluations()
+        wanted = np.ones(len(inputs.h), dtype=np.bool_)
+    else:
+        result, count, wanted = solved
     if wanted.any():
         with np.errstate(all="ignore"):
             for index in inputs.blocks(wanted):
