@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from rig.base.errors import DataError
-from rig.base.toml_file import parse_table
+from rig.log.contents import scene_in
 from rig.log.reader import read_log
-from rig.scene.scene import Scene
 
 # What of a result is the value: the name in the log, the column of the table, the factor to its unit.
 VALUES = {
@@ -41,18 +40,14 @@ def log_rows(path: Path, value: str) -> list[dict[str, Any]]:
     }
     if not found:
         raise DataError(f'{path}: has no result of a step do = "breakdown". Which log has one, `dea-rig info` tells.')
-    attached = log.attachments.get("scene.toml")
-    if attached is None:
-        raise DataError(f"{path}: holds no scene, so its specimen is not known.")
-    scene = parse_table(attached.data.decode("utf-8", "replace"), Scene, "scene", f"{path}, scene.toml")
+    scene = scene_in(log)
     specimen = scene.specimen.name or path.stem
-    no_current = scene.hv is not None and not scene.hv.measures_current
     last = max(found)
     return [
         {
             column: one["value"] * factor,
             "censored": one["outcome"] != FAILED,
-            "upper_bound": no_current and one["outcome"] == FAILED,
+            "upper_bound": scene.breakdowns_are_bounds and one["outcome"] == FAILED,
             "specimen": specimen if step == last else f"{specimen}, step {step}",
             "note": f"{path.name}, step {step}: {one['outcome']}",
         }

@@ -14,8 +14,7 @@ from calibration.film.assumed import assumed_uncertainties
 from calibration.rounding import percent
 from drivers.roles import HVFlag
 from rig.base.errors import DataError
-from rig.base.toml_file import parse_table
-from rig.log.contents import certificates_in
+from rig.log.contents import certificates_in, scene_in
 from rig.log.dataset import interpolate
 from rig.log.reader import Log, read_log
 from rig.scene.scene import Scene
@@ -44,7 +43,7 @@ def permittivity_of(paths: Sequence[Path]) -> Permittivity:
 def charging_of(paths: Sequence[Path]) -> tuple[list[Charging], Known]:
     """Currents in the logs of one specimen, and what is known beside them; errors as of `permittivity_of`."""
     logs = [read_log(path) for path in paths]
-    scenes = [_scene(log) for log in logs]
+    scenes = [scene_in(log) for log in logs]
     names = sorted({scene.specimen.name for scene in scenes})
     if len(names) > 1:
         raise DataError(f"These logs are of {len(names)} specimens ({', '.join(names)}): name those of one.")
@@ -52,13 +51,6 @@ def charging_of(paths: Sequence[Path]) -> tuple[list[Charging], Known]:
         if scene.hv is None or "/hv/sample" not in log.topics:
             raise DataError(f"{log.path}: its scene has no [hv] instrument, so there is no current.")
     return [_charging(*one) for one in zip(logs, scenes, strict=True)], _known(logs[0], scenes[0])
-
-
-def _scene(log: Log) -> Scene:
-    attached = log.attachments.get("scene.toml")
-    if attached is None:
-        raise DataError(f"{log.path}: holds no scene, so its film is not known.")
-    return parse_table(attached.data.decode("utf-8", "replace"), Scene, "scene", f"{log.path}, scene.toml")
 
 
 def _charging(log: Log, scene: Scene) -> Charging:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rig.base.errors import ConfigError
+from rig.base.errors import ConfigError, DataError
 from rig.base.text import printable
-from rig.base.toml_file import parse_table
 from rig.campaign.campaign import Campaign
 from rig.campaign.progress import COMPLETE, Done, progress_of
 from rig.campaign.statistics import BOUNDS, RISING, Statistics, Value, plain, statistics_of
+from rig.log.contents import scene_in
 from rig.log.reader import Log, read_log
-from rig.scene.scene import Scene
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,6 +32,17 @@ UPPER_WORDS = (
     "They count as exact values here, so the true mean may be lower."
 )
 
+AT_LEAST, AT_MOST = "at least", "at most"
+
+
+class Result(NamedTuple):
+    """What a step found, in SI: value, standard uncertainty (NaN: none is stated), and whether it is a bound."""
+
+    value: float
+    uncertainty: float
+    unit: str
+    bound: str
+
 
 @dataclass(frozen=True)
 class Row:
@@ -38,14 +50,14 @@ class Row:
 
     Attributes
     ----------
-    results : dict of str to (float, float, str)
-        What the steps found, by name: value, standard uncertainty, unit; SI.
+    results : dict of str to Result
+        What the steps found, by name.
     found : str
         How the step that found it ended.
     """
 
     done: Done
-    results: dict[str, tuple[float, float, str]]
+    results: dict[str, Result]
     found: str
 
 
@@ -54,12 +66,15 @@ def rows_of(campaign: Campaign) -> list[Row]:
     rows = []
     for one in progress_of(campaign):
         complete = [run for run in one.runs if run.outcome == COMPLETE]
-        results: dict[str, tuple[float, float, str]] = {}
+        results: dict[str, Result] = {}
         found = ""
         if complete:
-            messages = [one.fields for one in read_log(campaign.logs / complete[-1].log).messages("/result")]
-            for fields in messages:
-                results[fields["name"]] = (fields["value"], fields["standard_uncertainty"], fields["unit"])
+            log = read_log(campaign.logs / complete[-1].log)
+            messages = [one.fields for one in log.messages("/result")]
+            bound_of = _bounds(log, messages)
+            for one_result in messages:
+                value, uncertainty, unit = (one_result[key] for key in ("value", "standard_uncertainty", "unit"))
+                results[one_result["name"]] = Result(value, uncertainty, unit, bound_of(one_result))
             found = _found(messages)
         rows.append(Row(one, results, found))
     return rows
@@ -83,32 +98,35 @@ def statistics(rows: list[Row], campaign: Campaign) -> list[Statistics]:
                 continue
             log = read_log(campaign.logs / run.log)
             messages = [message.fields for message in log.messages("/result")]
-            no_current = "breakdown" in _kinds(messages) and _measures_no_current(log)
+            bound_of = _bounds(log, messages)
             steps = {kind: sorted({f["step"] for f in messages if f["kind"] == kind}) for kind in _kinds(messages)}
             for f in messages:
                 place = f" (step {f['step']})" if len(steps[f["kind"]]) > 1 else ""
                 name = f"{f['kind']}: {plain(f['name'])}{place}"
-                bound = f["kind"] == "breakdown" and f["outcome"] in BOUNDS
-                broke = f["kind"] == "breakdown" and not bound
-                at_most = no_current and broke and f["name"] in RISING
+                bound = bound_of(f)
                 one = row.done.specimen
                 at = datetime.fromisoformat(run.date).timestamp() if run.date else math.nan
                 found.setdefault((name, f["unit"]), []).append(
-                    Value(one.name, one.batch, at, f["value"], bound, at_most)
+                    Value(one.name, one.batch, at, f["value"], bound == AT_LEAST, bound == AT_MOST)
                 )
     return [statistics_of(name, unit, values) for (name, unit), values in found.items()]
 
 
-def _measures_no_current(log: Log) -> bool:
-    """Whether the scene in it says so; a log without a scene that can be read says nothing."""
-    attached = log.attachments.get("scene.toml")
-    if attached is None:
-        return False
-    try:
-        hv = parse_table(attached.data.decode("utf-8", "replace"), Scene, "scene", f"{log.path}, scene.toml").hv
-    except ConfigError:
-        return False
-    return hv is not None and not hv.measures_current
+def _bounds(log: Log, messages: list[dict[str, Any]]) -> Callable[[dict[str, Any]], str]:
+    """What tells of which results of a log only a bound is known; a log without a scene that can be read has all."""
+    sags = False
+    if "breakdown" in _kinds(messages):
+        with contextlib.suppress(ConfigError, DataError):
+            sags = scene_in(log).breakdowns_are_bounds
+
+    def bound(fields: dict[str, Any]) -> str:
+        if fields["kind"] != "breakdown":
+            return ""
+        if fields["outcome"] in BOUNDS:
+            return AT_LEAST
+        return AT_MOST if sags and fields["name"] in RISING else ""
+
+    return bound
 
 
 def bounds_words(found: list[Statistics]) -> str:
@@ -188,15 +206,16 @@ def as_table(campaign: Campaign, rows: list[Row]) -> Table:
 def _short(row: Row, name: str, factor: float) -> str:
     if name not in row.results:
         return ""
-    value, uncertainty, _ = row.results[name]
-    return f"{value * factor:.4g} +- {uncertainty * factor:.2g}"
+    one = row.results[name]
+    said = f"{one.bound} {one.value * factor:.4g}".strip()
+    return f"{said} +- {one.uncertainty * factor:.2g}" if math.isfinite(one.uncertainty) else said
 
 
 def as_csv(rows: list[Row]) -> str:
     """The rows as CSV; results that only some have are empty for the others."""
     units: dict[str, str] = {}
     for row in rows:
-        units |= {name: unit for name, (_, _, unit) in row.results.items()}
+        units |= {name: one.unit for name, one in row.results.items()}
     heading = ["specimen", "batch", "standing", "runs", "log", "date", "outcome", "found"]
     for name, unit in units.items():
         heading += [f"{name} [{unit}]", f"standard uncertainty of {name} [{unit}]"]
@@ -210,6 +229,6 @@ def as_csv(rows: list[Row]) -> str:
         cells.append(row.found)
         for name in units:
             value = row.results.get(name)
-            cells += ["", ""] if value is None else [repr(value[0]), repr(value[1])]
+            cells += ["", ""] if value is None else [repr(value.value), repr(value.uncertainty)]
         writer.writerow(cells)
     return out.getvalue()

@@ -10,12 +10,14 @@ import numpy as np
 from drivers.instrument import MONITORS
 from drivers.roles import Identity
 from rig.base.certificates import parse_certificate
-from rig.base.errors import ConfigError
+from rig.base.errors import ConfigError, DataError
 from rig.base.text import printable
 from rig.base.text_file import decode
+from rig.base.toml_file import parse_table
 from rig.base.toml_text import parse_toml
 from rig.log.errors import LogError
 from rig.log.reader import Log
+from rig.scene.scene import Scene
 
 if TYPE_CHECKING:
     from calibration.sensors.certificate import Certificate
@@ -50,6 +52,22 @@ def bench_word(bench: str) -> str:
     if is_real(bench):
         return "REAL PORTS"
     return "REPLAY" if bench.startswith(REPLAY_OF) else "SIMULATED"
+
+
+def scene_in(log: Log) -> Scene:
+    """The scene that the log was recorded with.
+
+    Raises
+    ------
+    DataError
+        A log without a scene.
+    ConfigError
+        A scene that today's software cannot read.
+    """
+    attached = log.attachments.get("scene.toml")
+    if attached is None:
+        raise DataError(f"{log.path}: holds no scene, so its specimen is not known.")
+    return parse_table(attached.data.decode("utf-8", "replace"), Scene, "scene", f"{log.path}, scene.toml")
 
 
 def session_in(log: Log) -> dict[str, str]:

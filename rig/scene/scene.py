@@ -277,6 +277,11 @@ class Scene(Table):
         return {role: table.sample_rate for role, table in self.instruments.items()}
 
     @property
+    def breakdowns_are_bounds(self) -> bool:
+        """A supply without current shows a breakdown only once its output sags: the voltage before is too high."""
+        return self.hv is not None and not self.hv.measures_current
+
+    @property
     def on_real_ports(self) -> bool:
         """True when the instruments are reached through ports, False for the simulated bench in memory."""
         return self.stage.connected

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from rig.campaign.campaign import load_campaign
 from rig.campaign.progress import progress_of
-from rig.campaign.report import bounds_words, certificate_problems, rows_of, statistics, statistics_cells
+from rig.campaign.report import as_table, bounds_words, certificate_problems, rows_of, statistics, statistics_cells
 from rig.cli.app import main
 from rig.log.catalogue import INDEX, runs_in
 from rig.log.writer import LogWriter
@@ -77,7 +77,10 @@ def test_films_that_broke_on_a_supply_without_a_current_are_counted_as_upper_bou
             log.write("/result", result, START_NS, START_NS)
             log.write("/result", result | {"name": "displacement", "unit": "m", "value": 3e-3}, START_NS, START_NS)
             log.finish({"status": "complete"})
-    found = {one.name: one for one in statistics(rows_of(loaded), loaded)}
+    newest = rows_of(loaded)
+    fields = dict(zip(FIELDS, as_table(loaded, newest).columns[6].cells, strict=True))
+    assert (fields["a1"], fields["a2"], fields["b4"]) == ("at most 30", f"{FIELDS['a2'] / 1e6:.4g}", "at least 30")
+    found = {one.name: one for one in statistics(newest, loaded)}
     field, displacement = found["breakdown: field"], found["breakdown: displacement"]
     assert (field.upper_bounds, field.bounds, displacement.upper_bounds) == (1, 1, 0)
     assert "at most" in bounds_words([field]) and statistics_cells([field])[0][-1] == "1, 1 at most"
