@@ -357,17 +357,15 @@ EXPORT int64_t dea_kernel_solve(const Task *task, const Film *films, int64_t fil
 
 /* One state and what is found of it: `One` in model/membrane/compiled.py. */
 typedef struct {
-    const Task *task;
-    const Film *film;
     double h, voltage;
     Answer answer;
     Kept kept;
 } Single;
 
 /* Solve one state; returns its status. */
-EXPORT int64_t dea_kernel_solve_one(Single *one) {
+EXPORT int64_t dea_kernel_solve_one(const Task *task, const Film *film, Single *one) {
     const int64_t first = 0;
-    dea_kernel_solve(one->task, one->film, 1, &first, 1, &one->h, &one->voltage, &one->answer, &one->kept);
+    dea_kernel_solve(task, film, 1, &first, 1, &one->h, &one->voltage, &one->answer, &one->kept);
     return one->answer.status;
 }
 

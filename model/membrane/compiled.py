@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Sequence
-from ctypes import POINTER, Structure, addressof, byref, c_char_p, c_double, c_int64, c_void_p
+from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from functools import lru_cache
 from struct import Struct
 from typing import Any
@@ -177,8 +177,6 @@ class One(Structure):
     """One state and what the kernel finds of it: `Single` in membrane.c."""
 
     _fields_ = [
-        ("task", c_void_p),  # of the call alone
-        ("film", c_char_p),
         ("h", c_double),
         ("voltage", c_double),
         ("answer", _Answer),
@@ -240,7 +238,7 @@ class One(Structure):
         """The derivatives of the force, as `model.membrane.solution.Solutions` has them."""
         memory: Any = self
         slopes = np.frombuffer(memory, np.float64, len(SLOPES) + 2 * MOST_PARAMETERS, _ANSWER + _FRONT.size)
-        found: dict[str, Any] = dict(zip(SLOPES, slopes.tolist(), strict=False))
+        found: dict[str, Any] = dict(zip(SLOPES, slopes[: len(SLOPES)].tolist(), strict=True))
         for name, given in (("mu", len(material.mu)), ("alpha", len(material.alpha))):
             first = _SLOPES[name] - _SLOPES["h"]
             found[name] = slopes[first : first + given]
@@ -259,8 +257,8 @@ def solve_one(
         return None
     for most in TIERS:
         task = _task(tolerance, relaxed, sensitivities, most)
-        one = One(addressof(task), specimen.record, h, voltage)
-        status = kernel.dea_kernel_solve_one(byref(one))
+        one = One(h, voltage)
+        status = kernel.dea_kernel_solve_one(byref(task), specimen.record, byref(one))
         if status != NEEDS_TABLE:
             break
     return one if status >= 0 else None

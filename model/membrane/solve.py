@@ -122,14 +122,11 @@ class _Inputs:
         h_array = np.asarray(h, dtype=float)
         v_array = np.asarray(v, dtype=float)
         if isinstance(specimen, Specimen):
-            specimens = [specimen]
-            index = np.zeros((), dtype=np.intp)
+            specimens, index = [specimen], np.zeros((), dtype=np.intp)
+        elif isinstance(specimen, np.ndarray):
+            specimens, index = list(specimen.flat), np.arange(specimen.size, dtype=np.intp).reshape(specimen.shape)
         else:
-            grid = np.empty(len(specimen), dtype=object) if not isinstance(specimen, np.ndarray) else specimen
-            if not isinstance(specimen, np.ndarray):
-                grid[:] = list(specimen)
-            specimens = list(grid.ravel())
-            index = np.arange(len(specimens), dtype=np.intp).reshape(grid.shape)
+            specimens, index = list(specimen), np.arange(len(specimen), dtype=np.intp)
         shape = np.broadcast(index, h_array, v_array).shape
         which, hh, vv = (_spread(values, shape) for values in (index, h_array, v_array))
         return cls(shape, specimens, which, hh, vv)
