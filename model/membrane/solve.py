@@ -121,12 +121,14 @@ class _Inputs:
     ) -> _Inputs:
         h_array = np.asarray(h, dtype=float)
         v_array = np.asarray(v, dtype=float)
+        shape: tuple[int, ...]
         if isinstance(specimen, Specimen):
-            specimens, index = [specimen], np.zeros((), dtype=np.intp)
+            specimens, shape = [specimen], ()
         elif isinstance(specimen, np.ndarray):
-            specimens, index = list(specimen.flat), np.arange(specimen.size, dtype=np.intp).reshape(specimen.shape)
+            specimens, shape = specimen.ravel().tolist(), specimen.shape
         else:
-            specimens, index = list(specimen), np.arange(len(specimen), dtype=np.intp)
+            specimens, shape = list(specimen), (len(specimen),)
+        index = np.arange(len(specimens), dtype=np.intp).reshape(shape)
         shape = np.broadcast(index, h_array, v_array).shape
         which, hh, vv = (_spread(values, shape) for values in (index, h_array, v_array))
         return cls(shape, specimens, which, hh, vv)
