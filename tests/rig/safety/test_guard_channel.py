@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import zlib
 from collections.abc import Iterator
 
 import pytest
@@ -45,6 +46,60 @@ def test_what_was_said_before_the_end_is_heard(ends: tuple[Channel, Channel]) ->
     assert other.receive() == [{"last": "word"}]
     assert other.closed
     other.send({"more": 1})  # does no harm
+
+
+class Reset:
+    """A socket whose peer died with something unread; some systems say so once, ahead of what can still be read."""
+
+    def __init__(self, *what: bytes | type[OSError]) -> None:
+        self._what = list(what)
+
+    def setblocking(self, blocking: bool) -> None:
+        assert not blocking
+
+    def fileno(self) -> int:
+        return 99
+
+    def close(self) -> None:
+        pass
+
+    def recv(self, size: int) -> bytes:
+        one = self._what.pop(0)
+        if isinstance(one, bytes):
+            return one
+        raise one
+
+
+@pytest.mark.parametrize(
+    ("what", "read", "closed"),
+    [
+        ((b"", ConnectionResetError), [], True),
+        ((ConnectionResetError, b"frame", b""), [{"last": "word"}], True),
+        ((b"frame", ConnectionResetError, b"frame", ConnectionResetError), [{"last": "word"}] * 2, True),
+        ((ConnectionResetError, b"frame", BlockingIOError), [{"last": "word"}], True),
+        ((b"frame", OSError), [{"last": "word"}], True),
+        ((b"frame", BlockingIOError), [{"last": "word"}], False),
+        ((BlockingIOError,), [], False),
+    ],
+)
+def test_a_reset_is_an_end_and_is_read_past_once(
+    monkeypatch: pytest.MonkeyPatch, what: tuple[bytes | type[OSError], ...], read: list[object], closed: bool
+) -> None:
+    monkeypatch.delattr(socket, "recv_fds", raising=False)
+    frame = channel._pack({"last": "word"})
+    end = Channel(Reset(*(frame if one == b"frame" else one for one in what)))  # type: ignore[arg-type]
+    assert end.receive() == read
+    assert end.closed is closed
+
+
+def test_a_message_that_is_longer_than_allowed_or_no_table_is_damage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(socket, "recv_fds", raising=False)
+    for body in (b" " * (channel.LARGEST_MESSAGE + 1), b"[1]", b"{", b"[" * 100_000):
+        frame = channel._HEAD.pack(len(body), zlib.crc32(body)) + body
+        end = Channel(Reset(frame, BlockingIOError))  # type: ignore[arg-type]
+        with pytest.raises(ChannelDamaged):
+            end.receive()
+        assert end.closed
 
 
 def test_a_stopped_peer_holds_nobody_up_and_gets_whole_messages(
