@@ -107,6 +107,9 @@ class RemoteGuard:
         self._channel = Channel(ours)
         try:
             self._process = start.start_guard(theirs)
+        except BaseException:
+            self._channel.close()
+            raise
         finally:
             theirs.close()
         self._peer = Peer(self._process.pid)
