@@ -113,6 +113,7 @@ class _Kept(Structure):
 
 
 _FRONT = Struct("8d6q")  # an answer up to its derivatives
+_BY_NUMBERS = Struct(f"{len(SLOPES)}d")  # and these up to those by moduli
 _STATUSES = tuple(Status)
 
 
@@ -236,12 +237,10 @@ class One(Structure):
 
     def dforce(self, material: Material) -> dict[str, Any]:
         """The derivatives of the force, as `model.membrane.solution.Solutions` has them."""
+        found: dict[str, Any] = dict(zip(SLOPES, _BY_NUMBERS.unpack_from(self, _ANSWER + _FRONT.size), strict=True))
         memory: Any = self
-        slopes = np.frombuffer(memory, np.float64, len(SLOPES) + 2 * MOST_PARAMETERS, _ANSWER + _FRONT.size)
-        found: dict[str, Any] = dict(zip(SLOPES, slopes[: len(SLOPES)].tolist(), strict=True))
         for name, given in (("mu", len(material.mu)), ("alpha", len(material.alpha))):
-            first = _SLOPES[name] - _SLOPES["h"]
-            found[name] = slopes[first : first + given]
+            found[name] = np.frombuffer(memory, np.float64, given, _ANSWER + 8 * _SLOPES[name])
         return found
 
 

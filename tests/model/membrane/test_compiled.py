@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -225,6 +226,19 @@ def test_order_and_company_change_no_bit() -> None:
             alone += 1
             assert [getattr(one, name) for name in NUMBERS] == [getattr(found, name)[i] for name in NUMBERS]
     assert alone > 15
+
+
+def test_states_solved_in_several_threads_at_once_do_not_mix() -> None:
+    films, h, voltage = random_films(40, seed=6)
+
+    def solved(i: int) -> list[object]:
+        one = solve(films[i], float(h[i]), 0.5 * float(voltage[i]), tolerance=1e-6, sensitivities=True)
+        return [one.status, one.iterations, *(repr(getattr(one, name)) for name in NUMBERS), repr(one.dforce)]
+
+    alone = [solved(i) for i in range(40)]
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(5):
+            assert list(pool.map(solved, range(40))) == alone
 
 
 @pytest.mark.parametrize("wrinkling", ["plain", "tension_field"])
