@@ -35,6 +35,7 @@ from rig.log.errors import LogError
 MOST_WAITING = 8 * 1024 * 1024  # bytes not yet taken by the writer: half a minute of a run with all sensors at 1 kHz
 SILENCE_S = 0.8  # the writer says ten times a second that it lives, by a thread of its own ...
 MOST_IN_FRAME = 32 * 1024  # bytes of messages: so much a torn frame may take along
+SEND_S = 0.01  # rows wait so long for others
 LISTEN_S = 0.02  # how often we listen
 LATE_S = 0.05  # a turn of ours that took longer is not the writer's silence
 BUSY_S = 5.0  # ... and for how long it has waited for its disk, which may keep it that long
@@ -75,7 +76,8 @@ class RemoteLog:
         self._failure: LogError | None = None
         self._last_heard: float | None = None
         self._last_tick: float | None = None
-        self._next_listen = -math.inf
+        self._next_listen = self._next_send = -math.inf
+        self._sent = False  # since the last tick
         self._busy = 0.0  # for how long the writer has waited for its disk (s)
         self._heard: set[int] = set()  # kinds of frames since last looked
 
@@ -83,7 +85,7 @@ class RemoteLog:
         """Record one message, as `rig.log.writer.LogWriter.write` does.
 
         Commands and bytes for a wire are sent at once, so that they are in the log before they can take effect;
-        everything else with the next `tick`.
+        everything else with the next of them, or a `tick` at most `SEND_S` later.
         """
         if self._failure is not None:
             self._check()
@@ -102,7 +104,10 @@ class RemoteLog:
         Returns the bytes free on the log's disk, as the writer last said; None when they are not known.
         """
         self._check()
-        self._send()
+        if self._sent:
+            self._sent, self._next_send = False, now + SEND_S
+        elif now >= self._next_send:
+            self._send()
         if now >= self._next_listen:
             self._next_listen = now + LISTEN_S
             self._listen()
@@ -147,6 +152,7 @@ class RemoteLog:
         try:
             while self._waiting:
                 del self._waiting[: self._end.send(self._waiting)]
+            self._sent = True
         except BlockingIOError:
             pass
         except OSError:  # the writer has closed its end; it may have said why

@@ -40,6 +40,7 @@ from rig.log.recorder import Severity
 from rig.log.remote import RemoteLog
 from rig.log.schema import MONITORED, SETTINGS, Way
 from rig.safety.channel import Channel, ChannelDamaged, Message
+from rig.safety.expected import Expected
 from rig.safety.guard import ADVICE, GIVE_BACK, NOT_SAFE, Guard, GuardState
 from rig.safety.last_words import LastWords
 from rig.safety.limits import FilmLimits, Limits
@@ -51,7 +52,8 @@ from rig.scene.scene import Scene
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.001, 0.005  # the longest while an output is on its way to off
 ANSWER_S, IDLE_S = 0.01, 0.05  # a supply that awaits an answer, or nothing, is polled after so long at the latest
 STATE_S = 0.05  # how often the engine hears how it stands at least
-ALIVE_S = 0.02  # ... and that this loop turns
+ALIVE_S = 0.03  # ... and that this loop turns; with each heartbeat that is awaited, so that one turn does both
+SOON_S = 0.01  # ... but no more often than this
 AGAIN_S = 0.1  # a command that failed is given again at this interval
 INSIST_S = 1.0  # an off that was sent but is not measured is sent again at this interval
 BEGIN_S = 30.0  # how long the engine may take to say what is to be guarded
@@ -157,6 +159,7 @@ class Server:
         self._came = True  # whether it has said so
         self._host = HostTime(clock)
         self._supply: HVSupply | None = None
+        self._expected: Expected | None = None  # its answers
         self._lent: GivesBack | None = None  # the supply, where it gives back what arming changes
         self._guard: Guard | None = None
         self._gain = 1.0
@@ -214,7 +217,7 @@ class Server:
         self._insist(guard, now)
         if now >= self._next_state:
             self._tell_state(guard, supply, now)
-        elif now >= self._next_alive:
+        elif now >= self._next_alive - (ALIVE_S - SOON_S) * bool(messages):
             self._channel.send({"is": "alive"})
             self._next_alive = now + ALIVE_S
 
@@ -290,31 +293,33 @@ class Server:
         now = self._clock.now()
         self._words.speak()
         self._tick_log(now)
-        due, watched = now + LONGEST_TURN_S, False
-        if self._guard is not None and self._supply is not None:
+        due = watches = now + LONGEST_TURN_S
+        if self._guard is not None and self._supply is not None and self._expected is not None:
             # What is overdue already was tried in the turn before; it may go on failing, and is no cause for haste.
             instants = self._next_alive, self._guard.next_look
             due = min(self._due(self._guard, self._supply), *(at if at > now else due for at in instants))
-            unasked = self._polled_at + LONGEST_TURN_S  # what comes unasked, on a full bus, is not read one by one
-            watched = now >= unasked or self._awaits(self._supply)
-            due = due if watched else min(due, unasked)
-        wait = max(due - now, SHORTEST_TURN_S)
+            awaits = self._awaits(self._supply)
+            soonest = self._expected.after(self._polled_at, awaits)
+            # What comes unasked, on a full bus, is not read one by one.
+            watches = soonest if awaits else self._polled_at + LONGEST_TURN_S
+        due = max(due, now + SHORTEST_TURN_S)
         self._came = self._descriptor is None
         if self._channel.closed:
             self._came = True
-            self._clock.sleep_until(now + min(wait, LONGEST_TURN_S))
+            self._clock.sleep_until(min(due, now + LONGEST_TURN_S))
             return
         self._channel.flush()
-        ends: list[Channel | int] = [self._channel]
-        if watched and self._descriptor is not None:
-            ends.append(self._descriptor)
         try:
-            readable, _, _ = select.select(ends, [], [], wait)
+            if watches > now and select.select([self._channel], [], [], min(watches, due) - now)[0]:
+                return
+            ends: list[Channel | int] = [self._channel]
+            if self._descriptor is not None:
+                ends.append(self._descriptor)
+            readable, _, _ = select.select(ends, [], [], max(due - self._clock.now(), 0.0))
+            self._came |= self._descriptor in readable
         except (OSError, ValueError):  # the link was closed, and says so when it is read
             self._descriptor, self._came = None, True
-            self._clock.sleep_until(now + min(wait, LONGEST_TURN_S))
-            return
-        self._came |= self._descriptor in readable
+            self._clock.sleep_until(min(due, now + LONGEST_TURN_S))
 
     def _fault(self, error: BaseException) -> None:
         guard = self._guard
@@ -400,6 +405,7 @@ class Server:
         """Put the driver on its link: from here on it is polled."""
         self._gain = float(message["gain"])
         self._supply = make_supply(self._table, self._link, self._tell_wire, lambda: self._polled_at)
+        self._expected = Expected(self._supply)
         self._lent = self._supply if isinstance(self._supply, GivesBack) else None
         limits = Limits.of(self._scene)
         film = FilmLimits(self._scene.specimen.specimen(), limits)

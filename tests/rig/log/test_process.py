@@ -17,7 +17,7 @@ from rig.log.errors import LogError
 from rig.log.process import LogProcess
 from rig.log.reader import read_log
 from rig.log.recover import recover
-from rig.log.remote import MOST_WAITING, SILENCE_S, RemoteLog
+from rig.log.remote import MOST_WAITING, SEND_S, SILENCE_S, RemoteLog
 from rig.log.writer import LogWriter
 
 
@@ -115,17 +115,33 @@ def test_signals_are_not_for_the_writer(tmp_path):
     assert read_log(tmp_path / "a.mcap").topics == {"/force/sample": 100}
 
 
-def test_a_writer_that_dies_is_an_error_at_the_next_turn(tmp_path):
+def test_a_writer_that_dies_is_an_error_when_rows_are_sent_next(tmp_path):
     with pytest.raises(LogError, match="has ended") as caught, LogProcess(tmp_path / "a.mcap") as log:
         record(log)
         until(lambda: read_log(log.part).topics)
         os.kill(log.pid, signal.SIGKILL)
         log._process.wait()
         with pytest.raises(LogError, match=r"recover .*a\.mcap\.part"):
-            record(log, 1)
+            record(log, 1 + round(SEND_S * 1e3), start=50)
         record(log, 1)  # and so is every later call
     assert str(log.part) in caught.value.__notes__[0]
     assert read_log(log.part).topics["/force/sample"] > 0
+
+
+def test_rows_wait_for_others_but_not_for_long_and_commands_for_nobody():
+    mine, its = socket.socketpair()
+    log = RemoteLog(Path("a.mcap"), mine)
+    record(log)  # 50 ms
+    its.setblocking(False)
+    sent = frames.Unpacker().feed(its.recv(1 << 16))
+    assert {kind for kind, _ in sent} == {frames.MESSAGES} and 3 <= len(sent) <= 50e-3 / SEND_S
+    log.write("/raw/force/rx", {"t_s": 0.0, "data": b"a"}, 0, 0)
+    with pytest.raises(BlockingIOError):
+        its.recv(1)
+    log.write("/raw/force/tx", {"t_s": 0.0, "data": b"a"}, 0, 0)
+    assert its.recv(1 << 16)
+    log.close()
+    its.close()
 
 
 def test_a_writer_that_hangs_blocks_nobody(tmp_path):
