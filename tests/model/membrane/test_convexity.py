@@ -9,6 +9,7 @@ import pytest
 
 from model.material.gent import Gent
 from model.material.materials import NAMED, Material
+from model.membrane.convexity import _least
 from model.membrane.solve import Status, solve, solve_many
 from model.specimen import Specimen
 from model.stability.limits import slack_voltage
@@ -185,3 +186,42 @@ def test_a_sweep_to_slack_has_few_statuses_and_no_hole(name: str, lp: float) -> 
     order = runs(found.status)
     assert len(order) <= 4, order
     assert "NOT_CONVERGED" not in order, order
+
+
+X = np.array([0.0, 0.3, 0.5, 1.0, 1.2])  # uneven
+
+
+@pytest.mark.parametrize(
+    ("values", "wrinkled", "least"),
+    [
+        (3.0 + 2.0 * (X - 0.25) ** 2, 0, 3.0),
+        (3.0 + 2.0 * (X - 0.45) ** 2, 0, 3.0),  # a parabola has its own least, between the points
+        (3.0 + 2.0 * (X - 0.55) ** 2, 0, 3.0),
+        (3.0 + 2.0 * (X - 1.05) ** 2, 0, 3.0),
+        (3.0 + X, 0, 3.0),  # at an end it is that of the point
+        (4.0 - X, 0, 2.8),
+        (3.0 + 2.0 * (X - 1.15) ** 2, 0, 3.005),
+        (np.array([5.0, 4.0, np.nan, 4.0, 5.0]), 0, -2.125),  # no law there: -1 stands for it
+        (3.0 + 2.0 * (X - 0.45) ** 2, 2, 3.005),  # over the edge of a wrinkled zone no parabola leads
+        (3.0 + 2.0 * (X - 0.45) ** 2, 3, 3.005),
+        (3.0 + 2.0 * (X - 0.45) ** 2, 4, 3.0),
+    ],
+)
+def test_the_least_along_a_film_is_that_of_the_parabola_through_its_lowest_points(
+    values: np.ndarray, wrinkled: int, least: float
+) -> None:
+    """Two films side by side, the other one even; the first ``wrinkled`` points of the first are wrinkled."""
+    both = np.stack((values, np.full(5, 7.0)), axis=1)
+    zone = np.zeros((5, 2), dtype=np.bool_)
+    zone[:wrinkled, 0] = True
+    found = _least(np.stack((X, X), axis=1), both, zone)
+    assert found[0] == pytest.approx(least, abs=1e-12)
+    assert found[1] == 7.0
+
+
+def test_a_parabola_dips_below_its_points_by_no_more_than_half_of_what_they_differ() -> None:
+    place = np.array([[0.0], [0.9], [1.0]])
+    values = np.array([[2.0], [1.0], [1.9]])  # the parabola through them falls to less than 0.5
+    dip = np.polynomial.Polynomial.fit(place[:, 0], values[:, 0], 2)
+    assert dip(dip.deriv().roots()[0]) < 0.5
+    assert _least(place, values, np.zeros((3, 1), dtype=np.bool_))[0] == pytest.approx(0.5)
