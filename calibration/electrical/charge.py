@@ -38,6 +38,7 @@ PASSES = 2
 WEAK = 0.2  # relative uncertainty by current and resolution above which a supply cannot resolve it
 REST_S = 3.0  # shortest rest of which a leakage is told
 DECAYS = np.geomspace(0.3, 100.0, 25)  # s
+DECAY_STEPS = 6  # of Gauss and Newton, from the nearest of them
 
 
 class NotResolved(Exception):
@@ -421,16 +422,30 @@ def _leakages(one: Charging) -> list[Leakage]:
 
 
 def _asymptote(t: Array, current: Array) -> tuple[float, float]:
-    """The constant of ``a + b exp(-t/tau)`` and its standard uncertainty; of the mean where no decay shows."""
-    best = float(np.mean(current)), float(np.std(current, ddof=1) / math.sqrt(len(t)))
-    least = float(np.sum((current - best[0]) ** 2))
-    noise = least / (len(t) - 1)
-    for tau in DECAYS[(2 * t[-1] / len(t) < DECAYS) & (0.5 * t[-1] > DECAYS)]:
-        design = np.stack([np.ones_like(t), np.exp(-t / tau)], axis=1)
-        found, *_ = np.linalg.lstsq(design, current, rcond=None)
-        left = float(np.sum((current - design @ found) ** 2))
-        if left < least - 9.0 * noise:  # by more than chance
-            least = left
-            covariance = np.linalg.inv(design.T @ design) * left / max(len(t) - 3, 1)
-            best = float(found[0]), math.sqrt(float(covariance[0, 0]))
-    return best
+    """The constant of ``a + b exp(-t/tau)`` and its standard uncertainty; of the mean where no decay shows.
+
+    The decay is sought on a grid and brought to its minimum by Gauss and Newton; what is not known of it counts in the
+    uncertainty of the constant.
+    """
+    mean, count = float(np.mean(current)), len(t)
+    square = float(np.sum((current - mean) ** 2))
+    alone = mean, math.sqrt(square / (count - 1) / count)
+
+    def fitted(tau: float) -> tuple[Array, Array, Array]:
+        decay = np.exp(-t / tau)
+        design = np.stack([np.ones_like(t), decay], axis=1)
+        found = np.linalg.lstsq(design, current, rcond=None)[0]
+        return np.column_stack([design, decay * t / tau]), found, np.asarray(current - design @ found)
+
+    inside = DECAYS[(2 * t[-1] / count < DECAYS) & (0.5 * t[-1] > DECAYS)].tolist()
+    lefts = [float(np.sum(fitted(tau)[2] ** 2)) for tau in inside]
+    if not lefts or not min(lefts) < square * (1.0 - 9.0 / (count - 1)):  # by no more than chance
+        return alone
+    tau = inside[lefts.index(min(lefts))]
+    for _ in range(DECAY_STEPS):
+        design, found, left = fitted(tau)
+        step = float(np.linalg.lstsq(design, left, rcond=None)[0][2] / found[1])  # of ln tau
+        tau = min(max(tau * math.exp(max(min(step, 0.25), -0.25)), inside[0]), inside[-1])
+    design, found, left = fitted(tau)
+    covariance = np.linalg.inv(design.T @ design) * float(left @ left) / max(count - 3, 1)
+    return float(found[0]), math.sqrt(float(covariance[0, 0]))

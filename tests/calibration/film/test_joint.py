@@ -319,7 +319,8 @@ def replace_effects(found: _Found) -> _Found:
 def test_parts_of_an_uncertainty_are_those_of_the_covariance(fitted: tuple[Joint, list[Curve], _Found]) -> None:
     """All numbers free and no error but those fitted along: the squares of the parts are the inverse of J^T J."""
     joint, _, found = fitted
-    width = [high - low for low, high in (one.search for one in joint.coordinates.parameters[1:2])][0]
+    low, high = joint.coordinates.parameters[1].search
+    width = high - low
     known = np.zeros((1, found.point.x.size))
     known[0, 1] = math.sqrt(12.0) / width
     free = joint.varied(found.point.x)
