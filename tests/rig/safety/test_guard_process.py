@@ -529,7 +529,7 @@ def test_the_engine_hears_how_it_stands_and_that_it_turns(both: Both) -> None:
     assert max(b - a for a, b in pairwise(states)) <= process.STATE_S + 2 * TURN_S
     assert min(b - a for a, b in pairwise(states)) >= process.STATE_S - 1e-9
     gaps = [b - a for a, b in pairwise(any_)]
-    assert max(gaps) <= process.ALIVE_S + 2 * TURN_S and min(gaps) >= 0.005
+    assert max(gaps) <= process.ALIVE_S + 2 * TURN_S
     last = both.of("state")[-1]
     assert last["setpoint"] == 900.0 and last["commanded"] and last["ready"]
     assert last["ramp_duration"] == pytest.approx(900.0 / SCENE.hv.ramp_V_per_s)  # type: ignore[union-attr]
