@@ -93,10 +93,14 @@ class Places:
         return float(self.weight @ np.log(variance)), worth
 
     def shared(self, time: float, these: Sequence[int]) -> tuple[float, Array]:
-        """The value of the best shares of ``time`` (s) at ``these`` places, and the shares."""
+        """The value of the best shares of ``time`` (s) at ``these`` places, and the shares.
+
+        A share grows by the root of what it is worth: by the worth itself, shares go to and fro about those that make a
+        variance least (Fellman 1974; Torsney 1983).
+        """
         seconds = np.full(len(these), time / len(these))
         for _ in range(SHARES):
-            seconds = seconds * self.judge(seconds, these)[1]
+            seconds = seconds * np.sqrt(self.judge(seconds, these)[1])
             seconds *= time / seconds.sum()
         return self.judge(seconds, these)[0], seconds
 
@@ -126,8 +130,10 @@ def propose(places: Places, time: float, overhead: Overhead) -> list[Dwell]:
     """
 
     def judged(these: Sequence[int]) -> tuple[float, list[Dwell]]:
+        if len(these) < 2:
+            return math.inf, []
         left = time - overhead(_route(places, these, np.full(len(these), 2.0 * LEAST_DWELL)))
-        if len(these) < 2 or left < LEAST_DWELL * len(these):
+        if left < LEAST_DWELL * len(these):
             return math.inf, []
         value, seconds = places.shared(left, these)
         if seconds.min() < LEAST_DWELL:
@@ -137,6 +143,8 @@ def propose(places: Places, time: float, overhead: Overhead) -> list[Dwell]:
         return value, _route(places, these, seconds)
 
     everywhere = range(places.h.size)
+    if len(everywhere) < 2:
+        return []
     _, ideal = places.shared(time, everywhere)
     chosen: list[int] = []
     for k in np.argsort(-ideal):  # the ideal's places, one of each neighbourhood

@@ -55,7 +55,7 @@ class TimedProblem:
         law: type[Law],
         *,
         fixed: Mapping[str, float] | None = None,
-        negative_exponents: bool = True,
+        negative_exponents: bool,
     ) -> None:
         self.records = [SheetRecord.of(test) for test in tests]
         self.bins = [record.bins for record in self.records]

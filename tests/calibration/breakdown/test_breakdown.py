@@ -11,7 +11,7 @@ from scipy import stats
 from calibration.breakdown.compare import area_scaling, compare_groups, compare_lognormal
 from calibration.breakdown.intervals import SCALE, Interval, WeibullFit, fit_weibull
 from calibration.breakdown.location import fit_location
-from calibration.breakdown.sample import Sample
+from calibration.breakdown.sample import Sample, simulate
 from calibration.breakdown.study import study
 from calibration.breakdown.weibull import (
     fit,
@@ -172,3 +172,24 @@ def test_a_drift_within_the_table_is_warned_of_without_groups() -> None:
 def test_the_same_seed_gives_the_same_numbers() -> None:
     sample = campaign(np.random.default_rng(11), 10, "random")
     assert study(sample, None, 5, 200) == study(sample, None, 5, 200)
+
+
+def test_a_campaign_that_was_ended_by_a_failure_is_simulated_with_as_many_failures() -> None:
+    """Three survivors at the last failure: the number of failures was chosen; by a ceiling it is left to chance."""
+    ended, ceiling = (campaign(np.random.default_rng(8), 10, how) for how in ("strongest", "ceiling"))
+    y, failed = simulate(ended, SHAPE, np.full(10, math.log(TRUE_SCALE)), np.random.default_rng(9), 40)
+    assert (failed.sum(axis=1) == 7).all()
+    assert (np.sort(y, axis=1)[:, -4:] == y.max(axis=1, keepdims=True)).all()
+    _, by_ceiling = simulate(ceiling, SHAPE, np.full(10, math.log(TRUE_SCALE)), np.random.default_rng(9), 40)
+    assert len(set(by_ceiling.sum(axis=1).tolist())) > 2
+
+
+def test_newtons_method_for_a_lognormal_doubles_its_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seven steps are enough from a start without knowledge; with a wrong slope it would creep."""
+    sample = campaign(np.random.default_rng(3), 25, "ceiling")
+    data = stats.CensoredData.right_censored(sample.value, ~sample.failed)
+    s, _, middle = stats.lognorm.fit(data, floc=0)
+    density, survival = (one(sample.value, s, 0, middle) for one in (stats.lognorm.logpdf, stats.lognorm.logsf))
+    monkeypatch.setattr("calibration.breakdown.weibull.STEPS", 7)
+    found = lognormal_log_likelihood(*sample.rows[:2])[0]
+    assert found == pytest.approx(np.where(sample.failed, density, survival).sum(), abs=1e-6)

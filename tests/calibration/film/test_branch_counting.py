@@ -10,7 +10,20 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.film.branches import spectrum
-from calibration.film.branches.counting import hidden, left_out, shifted
+from calibration.film.branches.counting import (
+    aicc,
+    free_columns,
+    further_times,
+    grid,
+    hidden,
+    left_out,
+    misfit,
+    numbers,
+    searched,
+    shifted,
+    shows_from,
+    unknown_columns,
+)
 from calibration.film.branches.result import FoundBranch, Known, LeftOut
 
 Array = NDArray[np.float64]
@@ -161,3 +174,92 @@ def test_a_branch_that_predicts_badly_alone_is_passed_over_once(
     monkeypatch.setattr(spectrum, "pays", lambda joint, fewer, more: (1.0, more in earned))
     counting = spectrum._Counting(Fits(), 0, None)  # type: ignore[arg-type]
     assert [one.point for one in counting.fits] == list(range(number + 1))
+
+
+def test_a_part_counts_as_many_numbers_as_it_alone_tells_less() -> None:
+    """The last part alone tells of one column: of its 25 numbers, one is spent on that. By fits to the rest."""
+    wave = np.where(STRETCHES == 3, 3.0 * np.cos(60.0 * TIME), 0.0)
+    columns = np.stack((COLUMNS[:, 0], COLUMNS[:, 1], np.where(STRETCHES == 3, 1.0 - TIME, 0.0)), axis=1)
+    made = Line(columns, STRETCHES, columns @ [300.0, 200.0, 500.0] + wave)
+    rest = Line(columns[STRETCHES < 3], STRETCHES[STRETCHES < 3], made.data[STRETCHES < 3])
+    parts = [(25 - 1, made.cost - rest.cost)]
+    for k in range(3):
+        mine = ~np.isin(STRETCHES, k)
+        other = Line(columns[mine], STRETCHES[mine], made.data[mine])
+        parts.append((25, made.cost - other.cost))
+    found, expected = left_out(made, made), LeftOut.judged(1.0, parts, misfit(made, made))
+    assert found.expected == pytest.approx(expected.expected, rel=1e-6)
+    assert found.chance == pytest.approx(expected.chance, rel=1e-4)
+
+
+def test_the_criterion_is_that_of_hurvich_and_tsai() -> None:
+    """AICc = chi^2 + 2 k + 2 k (k + 1)/(n - k - 1), of 3 numbers (the zero is an error) and 100 samples."""
+    made = Line(COLUMNS, STRETCHES, COLUMNS @ [3.0, 2.0, 5.0] + np.random.default_rng(1).standard_normal(100))
+    assert numbers(made, made) == 3
+    assert aicc(made, made, 1.0) == pytest.approx(made.cost + 6.0 + 24.0 / 96.0)
+    assert aicc(made, made, 2.0) == pytest.approx(made.cost / 2.0 + 6.0 + 24.0 / 96.0)
+
+
+def test_a_misfit_is_none_within_chance_and_grows_with_neighbours_that_err_together() -> None:
+    random = np.random.default_rng(2)
+    right = Line(COLUMNS, STRETCHES, random.standard_normal(100))
+    assert misfit(right, right) == 1.0
+    alone = Line(COLUMNS, STRETCHES, 3.0 * random.standard_normal(100))
+    data = alone.residual[:100]
+    assert misfit(alone, alone) == pytest.approx(float(data @ data) / (100 - 3))
+    pairs = Line(COLUMNS, STRETCHES, np.repeat(3.0 * random.standard_normal(50), 2))
+    data = pairs.residual[:100]
+    ratio = float(data @ data) / (100 - 3)
+    rho = float(data[1:] @ data[:-1]) / float(data @ data)
+    assert misfit(pairs, pairs) == pytest.approx(ratio * (1.0 + 2.0 * rho), rel=1e-9)
+
+
+class Branched(Line):
+    """Of its four numbers a ratio and a time: bounded, and the ratio at 0 in one of two cases."""
+
+    at = 1.0
+
+    @property
+    def x(self) -> Array:
+        return np.array([1.0, self.at, 2.0, 0.3])
+
+    def count(self, x: Array) -> int:
+        return 1
+
+    def bounds(self, x: Array) -> tuple[Array, Array]:
+        return np.array([-np.inf, 0.0, -1.0, -np.inf]), np.array([np.inf, 20.0, 2.0, np.inf])
+
+
+def test_a_number_at_its_bound_is_not_free_but_a_time_at_the_end_of_the_search_is_no_knowledge() -> None:
+    made = Branched(COLUMNS, STRETCHES, TIME)
+    assert free_columns(made, made).tolist() == [True, True, False, True]
+    assert unknown_columns(made, made).tolist() == [True, True, True, True]
+    assert numbers(made, made) == 2
+    gone = Branched(COLUMNS, STRETCHES, TIME)
+    object.__setattr__(gone, "at", 0.0)
+    assert free_columns(gone, gone).tolist() == [True, False, False, True]
+    assert unknown_columns(gone, gone).tolist() == [True, False, False, True]  # without the branch it has no time
+
+
+def test_times_that_are_tried_and_those_that_may_hide() -> None:
+    """Four a decade over the window of two decades; hidden ones 1.3 decades on, half a decade off what was found."""
+    made = Line(COLUMNS, STRETCHES, TIME)
+    assert grid(made, 0.0) == pytest.approx(np.geomspace(0.1, 10.0, 9))
+    assert grid(made, 1.3)[-1] == pytest.approx(10.0**2.3)
+    assert np.exp(searched((0.3, 20.0))) == pytest.approx([0.1, 200.0])
+    found = further_times(made, np.array([1.0]), 50.0)
+    assert np.abs(np.log10(found)).min() == pytest.approx(0.5)
+    assert {round(float(one), 4) for one in found} >= {round(10.0**-0.5, 4), round(10.0**0.5, 4), 0.1}
+    assert found.max() <= 50.0
+    assert further_times(made, np.array([0.2]), 50.0).min() > 0.2  # none below the window
+
+
+def test_a_branch_shows_from_the_size_that_would_earn_its_place_in_95_of_100() -> None:
+    """A shape of norm n beside what is free: (sqrt(7 + 4) + 1.645)/n; one that lies in it never shows."""
+    along, other = np.eye(100)[:2] * 40.0
+    made = Line(along[:, None], STRETCHES, 2.0 * along)
+    free = np.array([True, False])
+    rows = np.append(np.stack((other, along + 0.5 * other, along, 0.1 * other)), np.zeros((4, 1)), axis=1)
+    needed = (math.sqrt(11.0) + 1.6449) / 40.0
+    assert shows_from(made, free, rows, 1.0) == pytest.approx([needed, 2.0 * needed, math.inf, math.inf])
+    assert shows_from(made, free, rows[:1], 4.0) == pytest.approx([2.0 * needed])

@@ -14,7 +14,8 @@ from calibration.film.identifiability import expected_uncertainties
 from calibration.film.identify import IdentificationError, compare, identify, secant_modulus
 from calibration.film.problem import Problem
 from calibration.film.reduction import select
-from calibration.film.result import Identification
+from calibration.film.result import GOOD, WEAK, Identification, Quantity
+from calibration.film.summary import _viscous
 from model.material.materials import NAMED, Material
 from model.membrane.solve import solve_many
 from model.specimen import Specimen
@@ -71,6 +72,22 @@ def test_exponents_that_are_not_determined_count_as_within_their_range(paper: Id
     part = "range of exponents"
     assert paper.quantities["eps_r"].budget[part] > 0.0 and paper.quantities["G"].budget[part] > 0.0
     assert not any(part in paper.quantities[name].budget for name in ("mu1", "alpha1", "stiffness"))
+
+
+def test_nothing_is_said_of_what_is_not_there(paper: Identification) -> None:
+    """Independent samples, with voltage, of an elastic film."""
+    assert paper.samples_per_independent == 1.0
+    for word in ("are correlated", "no sample with voltage", "viscous", "scatter"):
+        assert not any(word in one for one in paper.warnings), word
+
+
+def test_a_film_that_takes_time_is_a_doubt_of_what_is_not_identified_and_is_said_once() -> None:
+    sure = Quantity(1.0, 0.01, "1", {}, GOOD)
+    plain, other = replace(sure, verdict=WEAK), replace(sure, verdict=WEAK, doubt="a slack film")
+    said = replace(sure, verdict=WEAK, doubt="viscous film near 3 s could shift it unseen by 4 %")
+    assert _viscous(sure) == sure and _viscous(said) == said
+    assert _viscous(plain).doubt == "viscous film, fitted as elastic"
+    assert _viscous(other).doubt == "a slack film; viscous film, fitted as elastic"
 
 
 def test_right_model_and_right_noise_give_a_chi_square_of_one(paper: Identification) -> None:

@@ -147,6 +147,7 @@ def test_the_exact_model_has_the_forces_of_the_independent_cone(stated: tuple[Jo
     joint, x = stated
     before = joint.state
     point = exact_at(joint, x)
+    assert np.array_equal(joint.correction.at, x[:5])  # film and branches
     joint.state = before
     off = point.residual[: joint.force.size] * joint.sigma
     for one, mine in zip(joint.bins, np.split(off, [joint.bins[0].time.size]), strict=True):
