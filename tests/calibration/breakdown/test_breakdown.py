@@ -185,11 +185,13 @@ def test_a_campaign_that_was_ended_by_a_failure_is_simulated_with_as_many_failur
 
 
 def test_newtons_method_for_a_lognormal_doubles_its_digits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seven steps are enough from a start without knowledge; with a wrong slope it would creep."""
-    sample = campaign(np.random.default_rng(3), 25, "ceiling")
-    data = stats.CensoredData.right_censored(sample.value, ~sample.failed)
-    s, _, middle = stats.lognorm.fit(data, floc=0)
+    """Three failures below a ceiling that 27 survive: five steps leave less than 1e-9; with a wrong slope it creeps."""
+    value = stats.lognorm.rvs(0.2, scale=4000.0, size=30, random_state=np.random.default_rng(3))
+    sample = Sample(np.minimum(value, 3300.0), value <= 3300.0, np.ones(30))
+    assert sample.failed.sum() == 3
+    end = lognormal_log_likelihood(*sample.rows[:2])[0]
+    s, _, middle = stats.lognorm.fit(stats.CensoredData.right_censored(sample.value, ~sample.failed), floc=0)
     density, survival = (one(sample.value, s, 0, middle) for one in (stats.lognorm.logpdf, stats.lognorm.logsf))
-    monkeypatch.setattr("calibration.breakdown.weibull.STEPS", 7)
-    found = lognormal_log_likelihood(*sample.rows[:2])[0]
-    assert found == pytest.approx(np.where(sample.failed, density, survival).sum(), abs=1e-6)
+    assert end == pytest.approx(np.where(sample.failed, density, survival).sum(), abs=1e-5)
+    monkeypatch.setattr("calibration.breakdown.weibull.STEPS", 5)
+    assert lognormal_log_likelihood(*sample.rows[:2])[0] == pytest.approx(end, abs=1e-9)

@@ -7,22 +7,26 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from calibration.electrical.agreement import AGREE, CONTRADICT, PART, SOFTENED, Charged, Difference
 from calibration.electrical.charge import Charging, Known, NotResolved
 from calibration.electrical.rows import Currents, charge_slope, currents_of
 from calibration.film.charged import ChargeModel
+from calibration.film.curve import Curve
 from calibration.film.identify import IdentificationError, identify
 from calibration.film.problem import Problem
 from calibration.film.reduction import select
 from calibration.film.result import Identification
 from model.material.laws import find_law
 from model.material.materials import Material
+from model.membrane.solve import solve_many
 from model.specimen import Specimen
 from tests.calibration.film.charged_runs import LEVELS, PLACES_M, Supply, capacitance, experiment
 from tests.calibration.film.independent import ONE_TERM
 from tests.calibration.film.shooting import Cone
 
+Array = NDArray[np.float64]
 TRUTH = 1.7
 EXACT: dict[str, float] = {}  # dimensions and gains as believed
 
@@ -256,3 +260,42 @@ def test_a_curve_that_is_left_out_does_not_bring_softening_into_the_fit() -> Non
     assert found.provenance["settings"]["along"] == []
     with pytest.raises(IdentificationError, match="nothing to do with it"):  # who asks for it is told
         identify([curves[0], high], terms=1, starts=1, currents=currents, along=["softening"])
+
+
+def test_a_zero_of_the_displacement_moves_the_charge_of_its_own_run_alone() -> None:
+    """By the slope of the capacitance over the displacement, which the model has at displaced places."""
+    at = Material(name="at", mu=ONE_TERM["mu"], alpha=ONE_TERM["alpha"], eps_r=1.7)  # type: ignore[arg-type]
+    currents = rising(at)
+    h = np.linspace(0.5e-3, 9e-3, 40)
+    force = solve_many(currents.specimen, h, 500.0).force
+    curves = [
+        Curve(
+            label=run, run=run, specimen=currents.specimen, h=h, force=force, voltage=np.full(40, 500.0),
+            nominal_voltage=500.0, direction=np.ones(40, dtype=np.int8), force_noise=1e-3, displacement_zero=1e-5,
+        )
+        for run in ("run", "another")
+    ]  # fmt: skip
+    problem = problem_of(currents, curves, at)
+    x = problem.vector(at)
+    own = slice(problem.force_rows, problem.data_rows)
+    assert own.stop > own.start
+    before, slopes = problem.residual(x)[own], problem.jacobian(x)[own]
+    zeros = [k for k, one in enumerate(problem.nuisances) if one.kind == "displacement_zero"]
+    assert [problem.nuisances[k].run for k in zeros] == ["run", "another"]
+    for k, moves in zip(zeros, (True, False), strict=True):
+        column = problem.film_parameters + k
+        moved = x.copy()
+        moved[column] = 1.0
+        change = problem.residual(moved)[own] - before
+        assert slopes[:, column] == pytest.approx(change, abs=1e-9)
+        if not moves:
+            assert (change == 0.0).all()
+            continue
+        further = replace(currents, places=[replace(one, h=one.h + 1e-5) for one in currents.places])
+        ends = [charged_model(one, at) for one in (further, currents)]
+        assert change == pytest.approx(ends[0] - ends[1], rel=0.02, abs=0.02 * np.abs(change).max())
+
+
+def charged_model(currents: Currents, at: Material) -> Array:
+    """Rows of the charge where nothing is moved."""
+    return ChargeModel(currents, at).evaluate([at], {}, np.zeros((1, len(currents.places)))).residual[0]
