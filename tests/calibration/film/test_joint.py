@@ -394,3 +394,14 @@ def test_a_start_has_the_time_and_the_size_of_the_branch_and_none_where_there_is
         (branch,) = joint.film(start).branches
         assert branch.ratio == pytest.approx(RATIO, rel=0.35)
         assert abs(math.log10(branch.time / TIME)) < 0.3
+
+
+def test_a_start_with_one_branch_more_keeps_the_time_of_the_one_that_is_there() -> None:
+    joint = joint_of([run("a", 4e-3, TWO_CYCLES, 3)])
+    poor = joint.vector(replace(ELASTIC, branches=(Branch(0.05, 0.1),)))
+    more = guess(joint, first_order(joint, poor), 1)
+    assert more is not None and joint.count(more) == 2
+    quick, slow = joint.film(more).branches
+    assert quick.time < 0.3  # all else moves to first order
+    assert abs(math.log10(slow.time / TIME)) < 0.3
+    assert slow.ratio == pytest.approx(RATIO, rel=0.4)
