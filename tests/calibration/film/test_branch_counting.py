@@ -24,7 +24,7 @@ from calibration.film.branches.counting import (
     shows_from,
     unknown_columns,
 )
-from calibration.film.branches.result import FoundBranch, Known, LeftOut
+from calibration.film.branches.result import FoundBranch, Known, LeftOut, blind_times
 
 Array = NDArray[np.float64]
 
@@ -263,3 +263,11 @@ def test_a_branch_shows_from_the_size_that_would_earn_its_place_in_95_of_100() -
     needed = (math.sqrt(11.0) + 1.6449) / 40.0
     assert shows_from(made, free, rows, 1.0) == pytest.approx([needed, 2.0 * needed, math.inf, math.inf])
     assert shows_from(made, free, rows[:1], 4.0) == pytest.approx([2.0 * needed])
+
+
+def test_times_that_look_like_stiffness_and_those_that_are_too_quick() -> None:
+    """A usual branch has a ratio of 0.1; from a third of the window on, and below 3 % of it, in steps of 1, 2, 5."""
+    alone = [(0.1, 0.6), (0.2, 0.51), (0.25, 0.5), (1.0, 0.9), (4.0, 0.1), (6.0, 0.11), (20.0, math.inf)]
+    assert blind_times(alone, 10.0) == (10.0, 0.2)
+    assert blind_times([(5.0, 0.2)], 10.0) == (5.0, 0.0)
+    assert blind_times([(1.0, 0.05)], 10.0) == (100.0, 0.0)

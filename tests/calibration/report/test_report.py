@@ -81,6 +81,11 @@ def test_the_numbers_are_in_it(html: str, found: Identification) -> None:
     eps, stiffness = found.quantities["eps_r"], found.quantities["stiffness"]
     assert " ± ".join(rounded(eps.value, eps.uncertainty)) in text
     assert " ± ".join(rounded(stiffness.value * 1e-3, stiffness.uncertainty * 1e-3)) + " kPa" in text
+    shear = found.quantities["G"]
+    assert shear.interval is None
+    for k in (-1.96, 1.96):
+        end = rounded((shear.value + k * shear.uncertainty) * 1e-3, shear.uncertainty * 1e-3)[0]
+        assert end in text, k
     assert "not identifiable from this data" in text
     assert f"{found.reduced_chi_square:.3f}" in text
     assert f"{found.used} samples used" in text

@@ -162,6 +162,9 @@ def test_steps_of_time_are_made_finer_until_they_are_good_enough() -> None:
     assert error < 1e-3
     assert np.abs(fine - true).max() / largest < 2.0 * error
     assert np.abs(coarse - true).max() > np.abs(fine - true).max()
+    easy = TimedProblem([made(0.05, 0.02)], 1, Ogden, negative_exponents=False)
+    easy.refine(easy.vector(film(easy), np.array([RATIO]), np.array([TIME])))
+    assert (easy.fine, easy.times[0].size) == (1, steps_of(easy.bins[0], 1).size)
 
 
 def test_stretches_of_several_tests_are_told_apart(problem: TimedProblem) -> None:
