@@ -288,3 +288,10 @@ def test_what_is_fixed_is_held_and_the_rest_is_found() -> None:
     falling = HomogeneousTest("falls", "uniaxial", stretch, stretch**-0.5, 5e4 * (1.0 - stretch**-3), nothing)
     assert fit_tests([falling], terms=1).alpha[0] < 0.0
     assert fit_tests([falling], terms=1, negative_exponents=False).alpha[0] > 0.0
+
+
+def test_the_share_of_the_variance_that_a_law_without_stress_explains_is_negative() -> None:
+    """Stresses of 1, 2 and 3 kPa about a mean of 2: 1 - 14/2."""
+    stretch, stress = np.array([1.1, 1.2, 1.3]), np.array([1e3, 2e3, 3e3])
+    test = HomogeneousTest("three", "uniaxial", stretch, stretch**-0.5, stress, np.full(3, np.nan))
+    assert r_squared((0.0,), (2.0,), test) == pytest.approx(-6.0)
