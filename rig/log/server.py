@@ -1,6 +1,6 @@
 """The process that writes a log for others: ``python -m rig.log.server PATH FD...``, started by `rig.log.process`.
 
-Each FD is the end of a producer; the first is the engine's. It writes a chunk when its first message is 60 ms old and
+Each FD is the end of a producer; the first is the engine's. It writes a chunk when its first message is 80 ms old and
 has the disk confirm it. It ends when the engine has finished the log, or when no producer is left: then the file is
 ended so that every reader can read it, says in its metadata ``cut`` that it was not finished, and stays ``.part``.
 Signals that end programs are ignored: they are for the engine, which then finishes the log.
@@ -23,7 +23,7 @@ from rig.log import frames, schema
 from rig.log.errors import LogError
 from rig.log.writer import LogWriter
 
-LONGEST_TURN_S, SHORTEST_TURN_S = 0.03, 0.03
+LONGEST_TURN_S, SHORTEST_TURN_S = 0.02, 0.02
 ALIVE_S = 0.1
 OTHERS_S = 5.0  # how long a finished engine waits for the others to end
 MOST_AT_ONCE = 1024 * 1024

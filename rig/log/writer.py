@@ -16,9 +16,9 @@ from rig.log.decimation import KEPT, Decimation
 from rig.log.errors import LogError
 from rig.log.part_file import PartFile
 
-# A chunk is written when its first message is this old, so that a loop that ticks every 30 ms or faster
+# A chunk is written when its first message is this old, so that a loop that ticks every 20 ms or faster
 # never has more than 100 ms of samples in memory.
-CHUNK_SECONDS = 0.06
+CHUNK_SECONDS = 0.08
 # Where most is left out, a chunk a cycle would make an index as large as the log. So much a power cut may take along;
 # the end of the process that records takes nothing, since another one writes.
 SPARSE_CHUNK_SECONDS = 2.0

@@ -36,7 +36,7 @@ from rig.safety.stopped import LOOK_S, Peer
 from rig.scene.scene import Scene
 
 START_S = 30.0  # until the process must have the link; a slow disk has many modules to read
-# A guard that says nothing for SILENCE_S is lost: it answers each of our heartbeats, so that a loaded computer
+# A guard that says nothing for SILENCE_S is lost: it says fifty times a second that it turns, so that a loaded computer
 # may hold it up for 0.14 s. One that was asked, and works out what the film bears, gets ANSWER_S. Before any voltage a
 # loaded computer may take longer.
 SILENCE_S, ANSWER_S = 0.16, 0.25

@@ -119,7 +119,7 @@ def reading(tmp_path: Path) -> Iterator[tuple[Reading, bytes]]:
     with LogWriter(path) as log:
         log.attach("scene.toml", "application/toml", b'title = "small"\n')
         for k in range(4):
-            t, ns = 0.05 * k, 10**18 + 50_000_000 * k
+            t, ns = 0.06 * k, 10**18 + 60_000_000 * k
             log.write("/force/sample", {"t_s": t, "reading": 0.1 * k, "force_N": -t, "flags": k}, ns, ns)
             log.write("/raw/force/rx", {"t_s": t, "data": bytes([k, 0xFF, 6, 0])}, ns, ns)
             log.tick(t)
