@@ -100,7 +100,7 @@ def _report(log: Log) -> list[str]:
     lines += [f"{topic}: {count} messages missing" for topic, count in log.missing.items()]
     if "cut" in log.metadata:
         reason = printable(log.metadata["cut"].get("reason", "not said why"))
-        lines.append(f"The run was cut short ({reason}): its last 100 ms may not have reached the log.")
+        lines.append(f"The run was cut short ({reason}): its last 150 ms may not have reached the log.")
     if not log.ended:
         lines.append("The log was cut short: what was recorded after the last message read is not known.")
     if log.outcome is None:
