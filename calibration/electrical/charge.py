@@ -38,7 +38,8 @@ PASSES = 2
 WEAK = 0.2  # relative uncertainty by current and resolution above which a supply cannot resolve it
 REST_S = 3.0  # shortest rest of which a leakage is told
 DECAYS = np.geomspace(0.3, 100.0, 25)  # s
-DECAY_STEPS = 6  # of Gauss and Newton, from the nearest of them
+DECAY_STEPS = 20  # of Gauss and Newton, from the nearest of them
+SLOWEST = 20.0  # of the time at rest: slower decays are as good as straight, and the error says so
 
 
 class NotResolved(Exception):
@@ -425,7 +426,7 @@ def _asymptote(t: Array, current: Array) -> tuple[float, float]:
     """The constant of ``a + b exp(-t/tau)`` and its standard uncertainty; of the mean where no decay shows.
 
     The decay is sought on a grid and brought to its minimum by Gauss and Newton; what is not known of it counts in the
-    uncertainty of the constant.
+    uncertainty of the constant, and so does what is left at the end of one that outlasts the rest.
     """
     mean, count = float(np.mean(current)), len(t)
     square = float(np.sum((current - mean) ** 2))
@@ -445,7 +446,9 @@ def _asymptote(t: Array, current: Array) -> tuple[float, float]:
     for _ in range(DECAY_STEPS):
         design, found, left = fitted(tau)
         step = float(np.linalg.lstsq(design, left, rcond=None)[0][2] / found[1])  # of ln tau
-        tau = min(max(tau * math.exp(max(min(step, 0.25), -0.25)), inside[0]), inside[-1])
+        tau = min(max(tau * math.exp(max(min(step, 0.5), -0.5)), inside[0]), SLOWEST * t[-1])
     design, found, left = fitted(tau)
     covariance = np.linalg.inv(design.T @ design) * float(left @ left) / max(count - 3, 1)
-    return float(found[0]), math.sqrt(float(covariance[0, 0]))
+    # Of a decay that outlasts the rest the end is not seen: what is left of it there is not known better than that.
+    unseen = float(found[1] * design[-1, 1]) if tau > 0.5 * t[-1] else 0.0
+    return float(found[0]), math.hypot(math.sqrt(float(covariance[0, 0])), unseen)

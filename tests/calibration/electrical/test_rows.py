@@ -207,6 +207,17 @@ def test_what_is_left_of_a_decaying_current_is_its_asymptote() -> None:
     assert flat_error == pytest.approx(1e-11 / math.sqrt(t.size), rel=0.2)
 
 
+@pytest.mark.parametrize("share", [0.8, 1.6])
+def test_the_end_of_a_decay_that_outlasts_the_rest_is_known_no_better_than_what_is_left_of_it(share: float) -> None:
+    t = np.linspace(0.0, 10.0, 200)
+    decay = 5e-8 * np.exp(-t / (share * t[-1]))
+    off = []
+    for seed in range(24):
+        value, error = _asymptote(t, 1e-8 + decay + 2e-9 * np.random.default_rng(seed).standard_normal(t.size))
+        off.append(abs(value - 1e-8) / error)
+    assert max(off) < 2.5
+
+
 def flat(h: float, volts: Array) -> Array:
     """A flat film stays one under voltage, as ring and disk hold it: its capacitance is constant."""
     return np.full_like(volts, 1.7 * FLAT + CABLE)
