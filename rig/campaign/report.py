@@ -212,13 +212,13 @@ def _short(row: Row, name: str, factor: float) -> str:
 
 
 def as_csv(rows: list[Row]) -> str:
-    """The rows as CSV; results that only some have are empty for the others."""
+    """The rows as CSV; results that only some have are empty for the others, and so is the bound of exact values."""
     units: dict[str, str] = {}
     for row in rows:
         units |= {name: one.unit for name, one in row.results.items()}
     heading = ["specimen", "batch", "standing", "runs", "log", "date", "outcome", "found"]
     for name, unit in units.items():
-        heading += [f"{name} [{unit}]", f"standard uncertainty of {name} [{unit}]"]
+        heading += [f"{name} [{unit}]", f"standard uncertainty of {name} [{unit}]", f"bound of {name}"]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(heading)
@@ -229,6 +229,6 @@ def as_csv(rows: list[Row]) -> str:
         cells.append(row.found)
         for name in units:
             value = row.results.get(name)
-            cells += ["", ""] if value is None else [repr(value.value), repr(value.uncertainty)]
+            cells += ["", "", ""] if value is None else [repr(value.value), repr(value.uncertainty), value.bound]
         writer.writerow(cells)
     return out.getvalue()

@@ -35,7 +35,7 @@ from rig.log.errors import LogError
 MOST_WAITING = 8 * 1024 * 1024  # bytes not yet taken by the writer: half a minute of a run with all sensors at 1 kHz
 SILENCE_S = 0.8  # the writer says ten times a second that it lives, by a thread of its own ...
 MOST_IN_FRAME = 32 * 1024  # bytes of messages: so much a torn frame may take along
-SEND_S = 0.01  # rows wait so long for others
+SEND_S = 0.01  # rows wait so long for others, from the first turn after the last were sent
 LISTEN_S = 0.02  # how often we listen
 LATE_S = 0.05  # a turn of ours that took longer is not the writer's silence
 BUSY_S = 5.0  # ... and for how long it has waited for its disk, which may keep it that long
@@ -85,7 +85,7 @@ class RemoteLog:
         """Record one message, as `rig.log.writer.LogWriter.write` does.
 
         Commands and bytes for a wire are sent at once, so that they are in the log before they can take effect;
-        everything else with the next of them, or a `tick` at most `SEND_S` later.
+        everything else with the next of them, or a `tick`: at most `SEND_S` after the next turn.
         """
         if self._failure is not None:
             self._check()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import math
@@ -13,7 +14,15 @@ from click.testing import CliRunner
 
 from rig.campaign.campaign import load_campaign
 from rig.campaign.progress import progress_of
-from rig.campaign.report import as_table, bounds_words, certificate_problems, rows_of, statistics, statistics_cells
+from rig.campaign.report import (
+    as_csv,
+    as_table,
+    bounds_words,
+    certificate_problems,
+    rows_of,
+    statistics,
+    statistics_cells,
+)
 from rig.cli.app import main
 from rig.log.catalogue import INDEX, runs_in
 from rig.log.writer import LogWriter
@@ -80,6 +89,9 @@ def test_films_that_broke_on_a_supply_without_a_current_are_counted_as_upper_bou
     newest = rows_of(loaded)
     fields = dict(zip(FIELDS, as_table(loaded, newest).columns[6].cells, strict=True))
     assert (fields["a1"], fields["a2"], fields["b4"]) == ("at most 30", f"{FIELDS['a2'] / 1e6:.4g}", "at least 30")
+    table = csv.DictReader(as_csv(newest).splitlines())
+    bounds = {one["specimen"]: one["bound of field"] for one in table}
+    assert (bounds["a1"], bounds["a2"], bounds["b4"]) == ("at most", "", "at least")
     found = {one.name: one for one in statistics(newest, loaded)}
     field, displacement = found["breakdown: field"], found["breakdown: displacement"]
     assert (field.upper_bounds, field.bounds, displacement.upper_bounds) == (1, 1, 0)
